@@ -1,0 +1,53 @@
+"""How fast each part runs, beside its ceiling or the published implementation's rate.
+
+    python benchmarks/throughput.py                    # every row (some minutes)
+    python benchmarks/throughput.py gridworld recsys   # only these groups
+
+Each group is one function that yields rows (what, rate, unit, reference, note). All numbers of a
+group come from one process on one machine, so ratios between its rows can be trusted even when the
+machine is slow or shared; absolute rates are this machine's. Nothing here is a test with a time limit.
+"""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the scripts live one level up
+
+Row = tuple[str, float, str, str, str]  # what, rate, unit, reference value, where it comes from
+GROUPS: dict[str, Callable[[], Iterator[Row]]] = {}
+
+
+def group(function: Callable[[], Iterator[Row]]) -> Callable[[], Iterator[Row]]:
+    """Register a generator of rows under its own name."""
+    GROUPS[function.__name__] = function
+    return function
+
+
+def rate(work: Callable[[], int], seconds: float = 2.0) -> float:
+    """Call `work` (returns how many units it did) for `seconds`, once before to warm up; units/s."""
+    work()
+    done, start = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - start) < seconds:
+        done += work()
+    return done / elapsed
+
+
+# ---- groups (one function per environment or algorithm) ----
+
+
+def main() -> None:
+    """Run the groups named on the command line (default: all) and print one table."""
+    names = sys.argv[1:] or list(GROUPS)
+    unknown = [name for name in names if name not in GROUPS]
+    if unknown:
+        raise SystemExit(f"error: unknown group {unknown[0]!r}; allowed: {', '.join(GROUPS)}")
+    print(f"{'what':58} {'rate':>12} {'unit':14} {'reference':>14}  source")
+    for name in names:
+        for what, value, unit, reference, source in GROUPS[name]():
+            print(f"{what:58} {value:12,.1f} {unit:14} {reference:>14}  {source}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
