@@ -1,0 +1,553 @@
+"""Grid World with 1,024 five-move skills (appendix A.1).
+
+An agent on a 9x9 grid crosses a river of lava through its single opening and walks to the goal. One
+action is a whole *skill*: five moves up, down, left or right, carried out one after the other. In
+every episode only 50 skills are on offer; at test time they are skills never used in training, so
+the agent has to understand what a skill does from recordings of it (the "play world" below).
+
+    #########     #  wall
+    #A..~...#     A  agent, always starts at (1, 1)
+    #...~...#     ~  lava: a whole row or column, here the column x = 4
+    #...o...#     o  the opening (the subgoal), here y = 3
+    #...~...#     G  goal, always at (7, 7)
+    #...~...#
+    #...~...#     x grows to the right, y grows downwards, both 0..8
+    #...~...#
+    #...~..G#     e.g. skill DDRRR then RRRDD then DDDDD: subgoal at move 5, goal at move 12
+    #########
+
+Commands:
+
+    python gridworld.py                # a solved and a random episode as GIFs, pictures of layouts,
+                                       # skills and recordings in runs/demo, a summary (seconds)
+    python gridworld.py --pool train --num-available 10 --seed 3
+
+Paper map (appendix -> here):
+
+    A.1 State                 GridWorldEnv._observation
+    A.1 Actions               SKILL_MOVES, GridWorldEnv.step
+    A.1 Reward, Eq. 1         goal_reward, LAMBDA_SUBGOAL
+    A.1 Action set split      split_actions
+    A.1 Action observations   action_observations
+    B, Fig. 4 (quadrants)     action_labels
+    5.4, engineered           engineered_representations
+    Table 3 (50 actions, 10)  NUM_AVAILABLE, MAX_SKILLS
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
+
+# ---- A.1 State: the cells of the 9x9 grid ----
+SIZE = 9  # A.1; the outer ring is wall, so 7x7 cells can be walked on
+EMPTY, WALL, GOAL, LAVA, AGENT, SUBGOAL = 1, 2, 8, 9, 10, 11  # published code (A.1: "integer ID")
+START, GOAL_CELL = (1, 1), (7, 7)  # A.1: top left, bottom right corner
+RIVERS = (3, 4, 5)  # published code: rows / columns that may hold the lava (A.1: "randomly placed")
+OPENINGS = (1, 2, 3, 4, 5, 6, 7)  # published code: the opening is any cell of the river
+
+# ---- A.1 Actions, Table 3 ----
+MOVE_NAMES = "RDLU"  # move ids 0..3: right, down, left, up
+MOVE_DELTAS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  # (4, 2): (dx, dy), y grows downwards
+SKILL_LENGTH = 5  # A.1
+NUM_ACTIONS = len(MOVE_NAMES) ** SKILL_LENGTH  # A.1: 4^5 = 1,024
+MAX_SKILLS = 10  # A.1, Table 3
+MAX_MOVES = MAX_SKILLS * SKILL_LENGTH  # A.1: 50; N_max of Eq. 1
+NUM_AVAILABLE = 50  # Table 3: actions on offer in one episode
+
+# ---- A.1 Reward ----
+LAMBDA_SUBGOAL = 0.1  # Eq. 1
+LAMBDA_GOAL = 0.9  # Eq. 1
+
+# ---- A.1 Action observations ----
+PLAY_LOW, PLAY_HIGH = 1, 78  # A.1: 80x80 grid; its ring of wall leaves 78x78 cells (published code)
+
+METRIC = "success"  # 1.0 when the episode ended on the goal, else 0.0
+MODALITIES = ("xy", "onehot")  # Fig. 4, first = the default: (x, y) trajectories
+
+# Skill id <-> moves: base 4, first move = least significant digit, so 0 = RRRRR and 1 = DRRRR.
+SKILL_MOVES = np.arange(NUM_ACTIONS)[:, None] // 4 ** np.arange(SKILL_LENGTH) % 4  # (1024, 5)
+
+
+def skill_name(skill: int) -> str:
+    """The five letters of a skill, e.g. 340 -> "RDDDD"."""
+    return "".join(MOVE_NAMES[move] for move in SKILL_MOVES[skill])
+
+
+def skill_id(name: str) -> int:
+    """The id of five letters, e.g. "RDDDD" -> 340."""
+    return sum(MOVE_NAMES.index(letter) * 4**t for t, letter in enumerate(name))
+
+
+def layout_id(orientation: str, river: int, opening: int) -> int:
+    """Number 0..41 of a layout, e.g. ("vertical", 4, 3): lava in column x = 4, opening at y = 3."""
+    row = ("vertical", "horizontal").index(orientation)
+    return (row * len(RIVERS) + RIVERS.index(river)) * len(OPENINGS) + OPENINGS.index(opening)
+
+
+def _build_layouts() -> np.ndarray:
+    """All 2 x 3 x 7 = 42 grids without the agent, as they appear in the state: (42, 81) uint8."""
+    grids = np.full((2, len(RIVERS), len(OPENINGS), SIZE, SIZE), EMPTY, np.uint8)  # [..., x, y]
+    grids[..., [0, -1], :] = grids[..., :, [0, -1]] = WALL
+    grids[..., *GOAL_CELL] = GOAL
+    for i, river in enumerate(RIVERS):
+        for j, opening in enumerate(OPENINGS):
+            grids[0, i, j, river, 1:-1] = LAVA  # vertical: a column, all y at one x
+            grids[0, i, j, river, opening] = SUBGOAL
+            grids[1, i, j, 1:-1, river] = LAVA  # horizontal: a row, all x at one y
+            grids[1, i, j, opening, river] = SUBGOAL
+    return grids.reshape(-1, SIZE * SIZE)  # (42, 81): flat index = x * 9 + y (published code)
+
+
+LAYOUTS = _build_layouts()  # start and goal lie outside rows/columns 3..5: all can be solved
+
+
+def goal_reward(moves):
+    """Goal part of Eq. 1 for `moves` = N_total moves made so far (a number or an array).
+
+    Bumps count as moves, the move onto the goal counts, the unused rest of the last skill does not.
+    """
+    # appendix: (1 - 0.9) * N/50; published code: 1 - 0.9 * N/50; we do the latter because the
+    # printed form pays *more* for a longer path, against the text ("encourage a shorter path").
+    return 1 - LAMBDA_GOAL * moves / MAX_MOVES
+
+
+# ---- A.1 Action Set Split; B and 5.4: what is known about each action ----
+
+
+def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray]:
+    """Random 2:1:1 split of the 1,024 skills (A.1), the same for every run with the same `seed`.
+
+    Returns sorted int64 ids: {"train": (512,), "valid": (256,), "test": (256,)}, disjoint.
+    Raises ValueError for any `split` other than "default".
+    """
+    if split != "default":
+        raise ValueError(f"unknown split {split!r}; allowed: 'default'")
+    order = np.random.default_rng(seed).permutation(NUM_ACTIONS)
+    train, valid, test = np.split(order, [NUM_ACTIONS // 2, NUM_ACTIONS * 3 // 4])
+    return {"train": np.sort(train), "valid": np.sort(valid), "test": np.sort(test)}
+
+
+def engineered_representations(variant: str = "12d") -> np.ndarray:
+    """Ground-truth features of all skills, float32 (1024, 12) or (1024, 5).
+
+    "12d": net (dx, dy) of the skill, then (dx, dy) of each of its five moves, in cells.
+    "5d": the id of each move, mapped from 0..3 to [-1, 1] (right, down, left, up).
+    Raises ValueError for any other variant.
+    """
+    # appendix: 5-d, the five moves; published code: 12-d; we default to the latter because the
+    # published "engineered" score was reached with it, and move ids have no meaningful order.
+    # published code: signs flipped; ours: plain (dx, dy), which a network cannot tell apart.
+    if variant == "12d":
+        deltas = MOVE_DELTAS[SKILL_MOVES]  # (1024, 5, 2)
+        features = np.concatenate([deltas.sum(1), deltas.reshape(NUM_ACTIONS, -1)], axis=1)
+    elif variant == "5d":
+        features = SKILL_MOVES * 2 / 3 - 1
+    else:
+        raise ValueError(f"unknown variant {variant!r}; allowed: '12d', '5d'")
+    return features.astype(np.float32)
+
+
+def action_labels() -> np.ndarray:
+    """Quadrant each skill moves the agent to (colours of Fig. 4): str (1024,), 256 of each kind.
+
+    Five is odd, so no skill ends where it began; the half axes belong to the quadrant that follows
+    clockwise from them (published code).
+    """
+    east, south = MOVE_DELTAS[SKILL_MOVES].sum(1).T  # (1024,) each
+    quadrants = {
+        "upper right": (south <= 0) & (east > 0),
+        "lower right": (south > 0) & (east >= 0),
+        "lower left": (south >= 0) & (east < 0),
+        "upper left": (south < 0) & (east <= 0),
+    }
+    return np.select(list(quadrants.values()), list(quadrants), default="")
+
+
+# ---- A.1 Action Observations: the play world ----
+
+
+def action_observations(
+    action_ids: np.ndarray,
+    num_observations: int = 1024,
+    modality: str = "xy",
+    seed: int = 0,
+    workers: int = 1,
+) -> np.ndarray:
+    """Record skills in an empty 80x80 grid, each from `num_observations` random cells (A.1, Table 4).
+
+    Returns uint8 (len(action_ids), num_observations, 6, 2): the cell (x, y) before the skill and
+    after each of its five moves, in cells, 1..78. E.g. skill UUURD from (3, 2): (3, 2) (3, 1)
+    (3, 1) (3, 1) (4, 1) (4, 2); the second and third move bump into the wall.
+
+    Both modalities are the same numbers: "xy" feeds them as they are, "onehot" is expanded by the
+    encoder to 80 + 80 zeros and ones per state, which would take 80 times the memory here.
+
+    Every skill has its own generator, seeded with (seed, id), so a recording does not depend on
+    which others are asked for. `workers` is ignored: all of it takes about a second.
+    Raises ValueError for ids outside 0..1023, num_observations < 1 or an unknown modality.
+    """
+    if modality not in MODALITIES:
+        raise ValueError(f"unknown modality {modality!r}; allowed: {', '.join(MODALITIES)}")
+    if num_observations < 1:
+        raise ValueError(f"num_observations is {num_observations}; allowed: 1 or more")
+    action_ids = _check_ids(action_ids)
+    paths = np.empty((len(action_ids), num_observations, SKILL_LENGTH + 1, 2), np.int8)
+    for i, action in enumerate(tqdm(action_ids, "recording skills", delay=2, disable=None)):
+        rng = np.random.default_rng([seed, action])
+        # published code: never starts on (78, 78), where a goal was left over; we have no goal.
+        paths[i, :, 0] = rng.integers(PLAY_LOW, PLAY_HIGH + 1, (num_observations, 2))
+    deltas = MOVE_DELTAS.astype(np.int8)[SKILL_MOVES[action_ids]]  # (A, 5, 2)
+    for t in range(SKILL_LENGTH):
+        after = paths[:, :, t] + deltas[:, None, t]  # (A, n, 2) + (A, 1, 2)
+        paths[:, :, t + 1] = after.clip(PLAY_LOW, PLAY_HIGH)  # a bump at the wall = stay
+    return paths.view(np.uint8)
+
+
+# ---- the environment, one move at a time ----
+
+
+def _check_ids(ids: np.ndarray) -> np.ndarray:
+    """Skill ids as a 1-D int64 array; ValueError when one is not in 0..1023."""
+    ids = np.asarray(ids)
+    if ids.ndim != 1 or (ids.size and not np.issubdtype(ids.dtype, np.integer)):
+        raise ValueError(
+            f"action ids have shape {ids.shape} and type {ids.dtype}; allowed: 1-D int"
+        )
+    bad = ids[(ids < 0) | (ids >= NUM_ACTIONS)]
+    if bad.size:
+        raise ValueError(f"action id {bad[0]} does not exist; allowed: 0..{NUM_ACTIONS - 1}")
+    return ids.astype(np.int64)
+
+
+def _check_pool(action_pool: np.ndarray | None, num_available: int) -> np.ndarray:
+    """The pool in ascending order (default: training skills); ValueError when it is unusable."""
+    pool = np.sort(_check_ids(split_actions()["train"] if action_pool is None else action_pool))
+    if (repeated := pool[1:][pool[1:] == pool[:-1]]).size:
+        raise ValueError(f"action id {repeated[0]} is in the pool twice; allowed: once")
+    if not 1 <= num_available <= len(pool):
+        raise ValueError(f"num_available is {num_available}; allowed: 1..{len(pool)} (the pool)")
+    return pool
+
+
+def _observation_space(num_available: int) -> gym.spaces.Dict:
+    return gym.spaces.Dict(
+        state=gym.spaces.Box(0, SUBGOAL, (SIZE * SIZE,), np.uint8),
+        available=gym.spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
+    )
+
+
+class GridWorldEnv(gym.Env):
+    """Lava crossing with five-move skills (appendix A.1).
+
+    ## Description
+    A 9x9 grid with a ring of wall and one row or column of lava (index 3, 4 or 5) that has a single
+    opening, the subgoal: 2 x 3 x 7 = 42 layouts. Moves are absolute and deterministic. A move into
+    a wall leaves the agent where it is and still counts.
+
+    ## Action Space
+    `Discrete(K)`: a position in the `available` array of the last observation. The skill found
+    there makes up to five moves; it is cut short by the goal or by lava.
+
+    ## Observation Space
+    `Dict` of
+    | key | space | meaning |
+    |---|---|---|
+    | state | Box(0, 11, (81,), uint8) | cell ids, flat index x * 9 + y: 1 empty, 2 wall, 8 goal, 9 lava, 10 agent (hides what it stands on), 11 subgoal |
+    | available | Box(0, 1023, (K,), int64) | ids of the skills on offer in this episode |
+
+    ## Rewards
+    0.1 for entering the subgoal the first time, 1 - 0.9 N / 50 for entering the goal with move
+    number N (Eq. 1), else 0. The best return is 0.1 + 1 - 0.9 * 12 / 50 = 0.884 in every layout.
+
+    ## Starting State
+    Agent at (1, 1), goal at (7, 7); layout uniform over the 42; `available` is drawn uniformly from
+    `action_pool` without replacement. When num_available is the size of the pool, `available` is
+    the pool in ascending order, always, so that one position means one skill.
+
+    ## Episode End
+    `terminated` on the goal or on lava, `truncated` after 10 skills (50 moves). The last step's info
+    holds `success` (1.0 or 0.0), `subgoal` (1 or 0), `moves` (1..50) and
+    `episode` = {"r": return, "l": number of skills}.
+
+    ## Arguments
+    `action_pool`: distinct ids that `available` is drawn from (default: the training skills).
+    `num_available`: K (default 50, Table 3). `render_mode`: None or "rgb_array".
+    `reset(options={"layout": i})` chooses the layout (0..41, see `layout_id`).
+    ValueError for a pool with unknown or repeated ids or fewer than K of them, and for K < 1.
+    """  # noqa: E501 (table)
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(
+        self,
+        action_pool: np.ndarray | None = None,
+        num_available: int = NUM_AVAILABLE,
+        render_mode: str | None = None,
+    ):
+        self.action_pool = _check_pool(action_pool, num_available)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r}; allowed: None, 'rgb_array'")
+        self.render_mode = render_mode
+        self.num_available = num_available
+        self.observation_space = _observation_space(num_available)
+        self.action_space = gym.spaces.Discrete(num_available)
+        self._over = True  # nothing to step until the first reset
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Draw a layout and the skills on offer; returns (observation, {})."""
+        super().reset(seed=seed)
+        self._layout, self._available = self._draw_episode()
+        if options and "layout" in options:
+            self._layout = options["layout"]
+            if self._layout not in range(len(LAYOUTS)):
+                raise ValueError(f"layout is {self._layout!r}; allowed: 0..{len(LAYOUTS) - 1}")
+        self._grid = LAYOUTS[self._layout].reshape(SIZE, SIZE)  # [x, y], without the agent
+        self._position = START
+        self._moves = self._skills = 0
+        self._return = 0.0
+        self._subgoal_taken = self._over = False
+        self._skill = None
+        self.trace = [START]  # cells of the last step, for render_frames
+        return self._observation(), {}
+
+    def _draw_episode(self) -> tuple[int, np.ndarray]:
+        layout = int(self.np_random.integers(len(LAYOUTS)))
+        if self.num_available == len(self.action_pool):
+            return layout, self.action_pool  # ascending order: a fixed meaning for every position
+        return layout, self.np_random.choice(self.action_pool, self.num_available, replace=False)
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        state = self._grid.copy()  # fresh arrays: a learner may keep them
+        state[self._position] = AGENT
+        return {"state": state.reshape(-1), "available": self._available.copy()}
+
+    def step(self, action: int):
+        """Carry out one skill; returns (observation, reward, terminated, truncated, info)."""
+        if self._over:
+            raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
+        if not 0 <= action < self.num_available:
+            raise ValueError(f"action is {action}; allowed: 0..{self.num_available - 1}")
+        self._skill = int(self._available[action])
+        self._skills += 1
+        self.trace = [self._position]
+        reward, entered = 0.0, EMPTY
+        for dx, dy in MOVE_DELTAS[SKILL_MOVES[self._skill]].tolist():
+            self._moves += 1
+            target = (self._position[0] + dx, self._position[1] + dy)
+            entered = self._grid[target]
+            if entered != WALL:  # a wall makes it a null move (A.1)
+                self._position = target
+            self.trace.append(self._position)
+            if entered == SUBGOAL and not self._subgoal_taken:
+                self._subgoal_taken = True
+                reward += LAMBDA_SUBGOAL
+            if entered == GOAL:
+                reward += goal_reward(self._moves)
+            if entered in (GOAL, LAVA):  # the rest of the skill is not carried out
+                break
+        success, terminated = bool(entered == GOAL), entered in (GOAL, LAVA)
+        # published code: the limit is a true end; we report `truncated`, the learner may treat both
+        # alike. It can only be reached with the last move of a skill: 10 x 5 moves are 50.
+        truncated = not terminated and self._moves >= MAX_MOVES
+        self._return += reward
+        self._over = terminated or truncated
+        info = {}
+        if self._over:
+            info = {
+                METRIC: float(success),
+                "subgoal": int(self._subgoal_taken),
+                "moves": self._moves,
+                "episode": {"r": self._return, "l": self._skills},
+            }
+        return self._observation(), reward, terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """One picture of the present state: uint8 (height, width, 3)."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs render_mode='rgb_array'; nothing is drawn")
+            return None
+        return draw_frame(self, len(self.trace) - 1)
+
+    def render_frames(self) -> list[np.ndarray]:
+        """Pictures of the last step, one per move (one picture of the start after reset)."""
+        first = 0 if self._skill is None else 1
+        return [draw_frame(self, move) for move in range(first, len(self.trace))]
+
+
+gym.register("ActionGen/GridWorld-v0", entry_point="gridworld:GridWorldEnv")
+
+
+# ---- the same rules as table look-ups, for training ----
+
+
+@functools.cache
+def skill_effects() -> np.ndarray:
+    """What every skill does from every cell of every layout: uint8 (42, 81, 1024, 5), built once.
+
+    Last axis: final cell, moves made, and 0/1 flags: subgoal entered, goal entered, lava entered.
+    """
+    effects = np.zeros((len(LAYOUTS), SIZE * SIZE, NUM_ACTIONS, 5), np.uint8)
+    jumps = (MOVE_DELTAS @ (SIZE, 1))[SKILL_MOVES]  # (1024, 5): steps along the flat index
+    for grid, effect in zip(LAYOUTS, effects, strict=True):
+        cell = np.repeat(np.arange(SIZE * SIZE)[:, None], NUM_ACTIONS, 1)  # (81, 1024)
+        moves, subgoal, goal, lava = np.zeros((4, *cell.shape), np.uint8)
+        for t in range(SKILL_LENGTH):
+            going = (goal | lava) == 0
+            target = (cell + jumps[:, t]).clip(0, grid.size - 1)  # clip: nobody stands on the ring
+            entered = np.where(going, grid[target], WALL)
+            moves += going
+            cell = np.where(entered == WALL, cell, target)
+            subgoal |= entered == SUBGOAL
+            goal |= entered == GOAL
+            lava |= entered == LAVA
+        effect[:] = np.stack([cell, moves, subgoal, goal, lava], axis=-1)  # (81, 1024, 5)
+    return effects
+
+
+class GridWorldVectorEnv(VectorEnv):
+    """`num_envs` Grid Worlds in numpy arrays, with the rules, spaces and infos of `GridWorldEnv`.
+
+    Ended episodes restart within the same step (SAME_STEP autoreset): the last observation and info
+    of such an episode are in infos["final_obs"] and infos["final_info"], in the form in which
+    gymnasium's SyncVectorEnv returns them. Arguments and errors: see `GridWorldEnv` and `make_vec`.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        num_envs: int,
+        action_pool: np.ndarray | None = None,
+        num_available: int = NUM_AVAILABLE,
+        seed: int | None = None,
+    ):
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}; allowed: 1 or more")
+        self.action_pool = _check_pool(action_pool, num_available)
+        self.num_envs, self.num_available = num_envs, num_available
+        self.single_observation_space = _observation_space(num_available)
+        self.single_action_space = gym.spaces.Discrete(num_available)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._np_random, self._np_random_seed = gym.utils.seeding.np_random(seed)
+        self._effects = skill_effects()
+        self._rows = np.arange(num_envs)
+        self._layout, self._cell, self._moves, self._skills = np.zeros((4, num_envs), np.int64)
+        self._return = np.zeros(num_envs)
+        self._subgoal_taken = np.zeros(num_envs, np.uint8)
+        self._available = np.tile(self.action_pool[:num_available], (num_envs, 1))  # (N, K)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Start all episodes anew; returns (observations, {}). A seed reseeds the one generator."""
+        super().reset(seed=seed)
+        self._bank = np.empty((0, self.num_available), np.int64)
+        self._start(self._rows)
+        return self._observation(), {}
+
+    def _start(self, envs: np.ndarray) -> None:
+        """New episodes for the sub-environments `envs` (m,)."""
+        self._layout[envs] = self.np_random.integers(len(LAYOUTS), size=len(envs))
+        if self.num_available < len(self.action_pool):
+            self._available[envs] = self._draw_available(len(envs))
+        self._cell[envs] = START[0] * SIZE + START[1]
+        for counter in (self._moves, self._skills, self._return, self._subgoal_taken):
+            counter[envs] = 0
+
+    def _draw_available(self, count: int) -> np.ndarray:
+        """`count` random sets from the pool: (count, K).
+
+        Drawing each set by itself would cost ten times the rest of the step. A random permutation
+        of the pool, cut into blocks of K, gives many sets for the price of one, each of them
+        exactly a uniform draw without replacement; only blocks of the same permutation depend on
+        each other (they are disjoint). The bank holds one permutation per sub-environment and hands
+        out first all their first blocks, then all their second blocks, to keep such blocks apart.
+        """
+        taken, self._bank = self._bank[:count], self._bank[count:]
+        if len(taken) < count:
+            blocks = len(self.action_pool) // self.num_available
+            pool = np.tile(self.action_pool, (self.num_envs, 1))
+            pool = self.np_random.permuted(pool, axis=1)[:, : blocks * self.num_available]
+            bank = pool.reshape(self.num_envs, blocks, -1).swapaxes(0, 1)  # (blocks, N, K)
+            bank = bank.reshape(-1, self.num_available)  # (blocks * N, K), first blocks first
+            missing = count - len(taken)
+            taken, self._bank = np.concatenate([taken, bank[:missing]]), bank[missing:]
+        return taken
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        state = LAYOUTS[self._layout]  # (N, 81), a copy
+        state[self._rows, self._cell] = AGENT
+        return {"state": state, "available": self._available.copy()}
+
+    def step(self, actions: np.ndarray):
+        """One skill in every sub-environment: `actions` int (N,), positions in `available`."""
+        actions = np.asarray(actions)
+        if actions.min() < 0 or actions.max() >= self.num_available:
+            raise ValueError(f"actions are {actions}; allowed: 0..{self.num_available - 1}")
+        skills = self._available[self._rows, actions]  # (N,) ids
+        self._cell[:], moves, subgoal, goal, lava = self._effects[
+            self._layout, self._cell, skills
+        ].T  # (N, 5) -> five (N,)
+        self._moves += moves
+        self._skills += 1
+        first_time = subgoal > self._subgoal_taken
+        self._subgoal_taken |= subgoal
+        rewards = LAMBDA_SUBGOAL * first_time + goal * goal_reward(self._moves)
+        self._return += rewards
+        terminated = (goal | lava) > 0
+        truncated = (self._moves >= MAX_MOVES) & ~terminated
+        observation, infos = self._observation(), {}
+        if (over := terminated | truncated).any():
+            infos = self._final_infos(observation, over, goal)
+            self._start(over.nonzero()[0])
+            observation = self._observation()
+        return observation, rewards, terminated, truncated, infos
+
+    def _final_infos(self, observation: dict, over: np.ndarray, goal: np.ndarray) -> dict:
+        """Last observations and infos of the episodes in the mask `over`, as SyncVectorEnv does."""
+        final_obs = np.full(self.num_envs, None, object)
+        for i in over.nonzero()[0]:
+            final_obs[i] = {key: array[i] for key, array in observation.items()}
+
+        def masked(**values: np.ndarray) -> dict:  # key -> values where over, _key -> the mask
+            masks = {f"_{key}": over.copy() for key in values}
+            return {key: value * over for key, value in values.items()} | masks
+
+        info = masked(
+            success=goal * 1.0, subgoal=self._subgoal_taken.astype(int), moves=self._moves
+        )
+        info |= {"episode": masked(r=self._return, l=self._skills), "_episode": over.copy()}
+        return {
+            "final_obs": final_obs,
+            "_final_obs": over.copy(),
+            "final_info": info,
+            "_final_info": over.copy(),
+        }
+
+
+def make_vec(
+    num_envs: int,
+    action_pool: np.ndarray | None = None,
+    num_available: int = NUM_AVAILABLE,
+    seed: int = 0,
+) -> GridWorldVectorEnv:
+    """`num_envs` Grid Worlds for training, all random draws from one generator seeded with `seed`.
+
+    A first reset() without a seed is determined by `seed`; reset(seed=s) reseeds everything.
+    Raises ValueError for a bad pool, num_available or num_envs (see `GridWorldEnv`).
+    """
+    return GridWorldVectorEnv(num_envs, action_pool, num_available, seed)
+
+
+def draw_frame(env, move):
+    return np.zeros((8, 8, 3), np.uint8)
