@@ -306,12 +306,13 @@ class GridWorldEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Draw a layout and the skills on offer; returns (observation, {})."""
+        layout = (options or {}).get("layout")
+        if layout is not None and layout not in range(len(LAYOUTS)):
+            raise ValueError(f"layout is {layout!r}; allowed: 0..{len(LAYOUTS) - 1}")
         super().reset(seed=seed)
         self._layout, self._available = self._draw_episode()
-        if options and "layout" in options:
-            self._layout = options["layout"]
-            if self._layout not in range(len(LAYOUTS)):
-                raise ValueError(f"layout is {self._layout!r}; allowed: 0..{len(LAYOUTS) - 1}")
+        if layout is not None:
+            self._layout = layout
         self._grid = LAYOUTS[self._layout].reshape(SIZE, SIZE)  # [x, y], without the agent
         self._position = START
         self._moves = self._skills = 0
@@ -377,12 +378,16 @@ class GridWorldEnv(gym.Env):
         if self.render_mode is None:
             gym.logger.warn("render() needs render_mode='rgb_array'; nothing is drawn")
             return None
-        return draw_frame(self, len(self.trace) - 1)
+        return draw_frame(self._layout, self.trace, self._skill, self._moves)
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step, one per move (one picture of the start after reset)."""
+        """Pictures of the last step, one per move (after reset: one picture of the start)."""
         first = 0 if self._skill is None else 1
-        return [draw_frame(self, move) for move in range(first, len(self.trace))]
+        before = self._moves - (len(self.trace) - 1)  # moves made before this step
+        return [
+            draw_frame(self._layout, self.trace[: move + 1], self._skill, before + move)
+            for move in range(first, len(self.trace))
+        ]
 
 
 gym.register("ActionGen/GridWorld-v0", entry_point="gridworld:GridWorldEnv")
@@ -549,5 +554,110 @@ def make_vec(
     return GridWorldVectorEnv(num_envs, action_pool, num_available, seed)
 
 
-def draw_frame(env, move):
-    return np.zeros((8, 8, 3), np.uint8)
+# ---- pictures (Figure 1) ----
+
+CELL = 40  # ours: pixels per cell, about the size of Figure 1 on a screen
+CAPTION = 60  # ours: pixels below the grid for the skill and the move counter
+FINE = 4  # ours: drawn 4 times larger, then averaged down: smooth edges without a drawing library
+COLORS = {  # ours, after Figure 1: grey wall, green goal, orange lava, blue subgoal, red agent
+    EMPTY: "#17191d",
+    WALL: "#6f7378",
+    GOAL: "#35b44a",
+    LAVA: "#f5821f",
+    SUBGOAL: "#2f6fe4",
+    AGENT: "#ee2b2b",
+}
+GRID_LINE, TRAIL, TEXT, DIM_TEXT, LAVA_WAVE = "#3c4046", "#8f2c2c", "#f2f2f2", "#80858c", "#a94a06"
+
+
+@functools.cache
+def _board(layout: int) -> Image.Image:
+    """The grid of a layout without the agent, FINE times too large."""
+    cell = CELL * FINE
+    image = Image.new("RGB", (SIZE * cell, SIZE * cell + CAPTION * FINE), COLORS[EMPTY])
+    draw = ImageDraw.Draw(image)
+    for (x, y), kind in np.ndenumerate(LAYOUTS[layout].reshape(SIZE, SIZE)):
+        left, top = x * cell, y * cell
+        draw.rectangle((left, top, left + cell, top + cell), COLORS[kind], GRID_LINE, FINE)
+        if kind == LAVA:
+            across = np.linspace(0.12, 0.88, 40)
+            for height in (0.3, 0.5, 0.7):
+                wave = height + 0.045 * np.sin(across * 4 * np.pi)
+                points = np.stack([left + across * cell, top + wave * cell], 1)  # (40, 2)
+                draw.line([*points.ravel()], LAVA_WAVE, 2 * FINE, "curve")
+    return image
+
+
+def draw_frame(layout: int, path: list, skill: int | None, moves: int) -> np.ndarray:
+    """Picture of a grid and the skill below it: uint8 (420, 360, 3).
+
+    `path`: the cells (x, y) from the start of the skill to the present one; `skill`: its id, None
+    before the first; `moves`: moves made in the episode so far.
+    """
+    image = _board(layout).copy()
+    draw = ImageDraw.Draw(image)
+    centres = (np.array(path) + 0.5) * CELL * FINE  # (moves of this skill + 1, 2)
+    done = len(path) - 1
+    heading = 0 if skill is None else SKILL_MOVES[skill, done - 1]
+    if done:
+        draw.line([*centres.ravel()], TRAIL, 4 * FINE, "curve")
+    for x, y in centres[:-1]:
+        draw.circle((x, y), 5 * FINE, TRAIL)
+    forward = MOVE_DELTAS[heading] * CELL * FINE * 0.36
+    side = np.array((-forward[1], forward[0])) * 0.85
+    tip, base = centres[-1] + forward, centres[-1] - forward * 0.8
+    corners = [*tip, *(base + side), *(base - side)]
+    draw.polygon(corners, COLORS[AGENT], "#5c0d0d", int(1.5 * FINE))
+    _draw_caption(draw, path[-1], LAYOUTS[layout], skill, done, moves)
+    return np.array(image.reduce(FINE))
+
+
+def _draw_caption(draw, position, grid, skill, done: int, moves: int) -> None:
+    """The five moves as keys (the present one lit), the move counter and what was entered."""
+    key, top = 32 * FINE, (SIZE * CELL + (CAPTION - 32) // 2) * FINE
+    for t, letter in enumerate(skill_name(skill) if skill is not None else " " * SKILL_LENGTH):
+        left = 14 * FINE + t * (key + 5 * FINE)
+        lit = skill is not None and t == done - 1
+        box = (left, top, left + key, top + key)
+        fill = COLORS[AGENT] if lit else "#2a2d33"
+        draw.rounded_rectangle(box, 6 * FINE, fill, GRID_LINE, FINE)
+        color = TEXT if t < done else DIM_TEXT
+        _text(draw, left + key / 2, top + key / 2, letter, color, 19, "mm")
+    kind = grid[position[0] * SIZE + position[1]]
+    words = {SUBGOAL: "subgoal", GOAL: "goal reached", LAVA: "lava"}
+    word = words.get(kind, "out of moves" if moves >= MAX_MOVES else "")
+    right = (SIZE * CELL - 14) * FINE
+    middle = top + key / 2
+    _text(draw, right, middle - 9 * FINE, f"move {moves} / {MAX_MOVES}", TEXT, 15, "rm")
+    _text(draw, right, middle + 10 * FINE, word, COLORS.get(kind if word else 0, TEXT), 15, "rm")
+
+
+def _text(draw, x: float, y: float, text: str, color: str, size: int, anchor: str) -> None:
+    draw.text((x, y), text, color, ImageFont.load_default(size * FINE), anchor)
+
+
+def episode_frames(
+    env: gym.Env, choose: Callable[[dict], int], seed: int | None = None, **reset_options
+) -> tuple[list[np.ndarray], dict]:
+    """Play one episode of `choose`(observation) -> action; returns (pictures, last info)."""
+    observation, info = env.reset(seed=seed, options=reset_options)
+    frames, over = env.render_frames(), False
+    while not over:
+        observation, _, terminated, truncated, info = env.step(choose(observation))
+        frames += env.render_frames()
+        over = terminated or truncated
+    return frames, info
+
+
+def save_gif(path: str | Path, frames: list[np.ndarray], fps: float) -> None:
+    """Write pictures as an endless GIF; the last one stays for 1.5 s. Creates missing folders."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    durations = [round(1000 / fps)] * (len(frames) - 1) + [1500]  # ours: time to see the outcome
+    images = [Image.fromarray(frame) for frame in frames]
+    temporary = path.with_name(path.name + ".part")  # a reader never meets a half-written file
+    with open(temporary, "wb") as file:
+        images[0].save(
+            file, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0
+        )
+    os.replace(temporary, path)
