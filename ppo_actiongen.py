@@ -1,0 +1,1412 @@
+"""PPO with a policy over changing sets of actions, and the train / validate / test protocol.
+
+The policy never sees action ids. It scores every action on offer by a shared utility of the state
+and of that action's representation c_i (hvae.py), and takes a softmax over the set A on offer:
+
+    pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
+
+so a set of actions it was never trained on is simply another list of vectors. Three regularisers
+make that work: a random subset of the training actions in every episode, an entropy bonus, and
+model selection on held-out *validation* actions. The test actions are used once, at the end.
+
+    python ppo_actiongen.py gridworld --quick        # the whole protocol in minutes on a laptop
+    python ppo_actiongen.py gridworld                # our recipe, full budget
+    python ppo_actiongen.py gridworld --recipe paper # Tables 3 and 4 to the letter
+    python ppo_actiongen.py gridworld --method nearest-neighbor        # baselines of section 5.3
+    python ppo_actiongen.py gridworld --ent-coef 0 | --no-subsample    # ablations
+    python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --actions test --num-available 20
+    python ppo_actiongen.py gridworld --help         # every hyper-parameter and its default
+
+Paper map (appendix)                                  here
+  Tables 3-4 hyper-parameters                         Args, PRESETS, FAST, QUICK
+  D.3.2 state encoder f_omega, critic V               StateEncoder, Agent.encode
+  D.3.2 utility function f_nu                         Agent.project_actions, FactorisedUtility
+  D.3.2 auxiliary policy f_chi                        Agent.auxiliary
+  baselines: nearest neighbour, continuous output     Agent.choose, Agent.logprob_entropy
+  Algorithm 1: training with action-set subsampling   train, rollout, gae, update
+  Algorithm 2: acting with new actions                evaluate
+
+Letters in shape comments: T rollout steps, N environments, B = T*N, K actions on offer,
+D size of a representation, H = 64 hidden units, A = NUM_ACTIONS rows of the table.
+"""
+
+import csv
+import importlib
+import json
+import math
+import os
+import shutil
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields, replace
+from inspect import signature
+from pathlib import Path
+from typing import Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from tqdm import tqdm
+
+# ---- hyper-parameters: Tables 3 and 4 ----
+
+MODULES = {
+    "gridworld": "gridworld",
+    "recsys": "recsys",
+    "create": "create_env",
+    "stacking": "stacking_env",
+}
+
+# What each environment's constructor accepts beyond the contract (A.3, C.3, C.5, C.6).
+TASK_OPTIONS = {
+    "gridworld": (),
+    "recsys": ("fully_observable",),
+    "create": ("task", "subgoal_reward"),
+    "stacking": ("placement",),
+}
+
+
+@dataclass
+class Args:
+    """Train a policy on training actions, select on validation actions, test on unseen ones."""
+
+    env: tyro.conf.Suppress[str] = "gridworld"
+
+    # What is trained
+    method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"
+    """utility = the paper's policy; the other two are its baselines."""
+    representation: str = "hvae"
+    """hvae | hvae-all (oracle encoder) | vae | engineered | engineered-5d | FILE.npz of hvae.py."""
+    modality: str | None = None
+    """Modality of the action observations the encoder sees (default: the environment's first)."""
+    split: str = "default"
+    """How the actions are split into train / validation / test (A.1-A.4)."""
+    recipe: Literal["fast", "paper"] = "fast"
+    """fast = ours, every difference listed in FAST; paper = Tables 3-4 to the letter."""
+    quick: bool = False
+    """The same protocol at a laptop budget (some minutes)."""
+    seed: int = 0
+    """One seed gives one run, bit for bit on one machine."""
+
+    # Task options, each for the environments that have it
+    task: str | None = None
+    """CREATE: which of the 12 tasks."""
+    subgoal_reward: bool = True
+    """CREATE: --no-subgoal-reward is the ablation of C.3."""
+    fully_observable: bool = False
+    """Recommender: the representation also holds mu_i (C.5)."""
+    placement: str | None = None
+    """Stacking: none | 1d | 2d (C.6)."""
+
+    # Policy, Table 3 (per environment, see PRESETS)
+    ent_coef: float = 0.05
+    """Entropy coefficient (Table 3); 0 is the ablation without entropy."""
+    num_available: int = 50
+    """K, actions on offer per episode (Table 3)."""
+    total_timesteps: int = 40_000_000
+    """Environment steps; one step = one action (Table 3)."""
+    minibatch_size: int = 4096
+    """PPO batch size of Table 3; a rollout holds num_minibatches times as many transitions."""
+    aux_ent_scale: float = 0.1
+    """Factor on the entropy of the position head (Table 3, continuous entropy scaling)."""
+    subsample: bool = True
+    """--no-subsample: all training actions are on offer in every episode (ablation)."""
+    fixed_set_size: int | None = None
+    """With --no-subsample: only this many random training actions (published: 2,000 of recsys)."""
+
+    # Policy, Table 4
+    learning_rate: float = 1e-3
+    """Adam's learning rate (Table 4)."""
+    gamma: float = 0.99
+    """Discount factor (Table 4)."""
+    num_envs: int = 32
+    """Parallel processes (Table 4)."""
+    hidden_size: int = 64
+    """Hidden layer size (Table 4)."""
+    vf_coef: float = 0.5
+    """Value loss coefficient (Table 4)."""
+    update_epochs: int = 4
+    """PPO epochs (Table 4)."""
+    clip_coef: float = 0.1
+    """PPO clip parameter (Table 4)."""
+
+    # Not in the appendix; values of the published code unless said otherwise
+    num_minibatches: int = 4
+    """Minibatches per epoch."""
+    gae_lambda: float = 0.95
+    """GAE lambda."""
+    max_grad_norm: float = 0.5
+    """Clip the global gradient norm here."""
+    adam_eps: float = 1e-5
+    """Adam's epsilon."""
+    lr_floor: float = 0.1
+    """The learning rate decays linearly to this fraction, not to zero."""
+    lr_decay_steps: int | None = None
+    """Steps over which it decays (default: total_timesteps)."""
+    clip_vloss: bool = True
+    """Clip the value loss as PPO's original code does, on the raw value scale."""
+    weight_decay: float = 0.0
+    """Decoupled weight decay on the utility's weights (ours; 0 = the paper's)."""
+    utility_gains: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    """Orthogonal gains of the utility's projection, hidden and output layer."""
+    one_hot: bool = False
+    """Integer states enter encoder and critic one-hot instead of running-normalised numbers."""
+    norm_obs: bool = True
+    """Running mean/std normalisation of vector states, clipped to +-10, frozen at evaluation."""
+    norm_reward: bool = True
+    """Divide training rewards by the running std of the discounted return (vector states)."""
+    standardize: bool = False
+    """Shift and scale the table to mean 0, std 1 over the training actions (ours)."""
+    utility_hidden: int | None = None
+    """Hidden width of the utility alone (default: hidden_size; wider is beyond the paper)."""
+
+    # Protocol
+    eval_every: int = 410_000
+    """Steps between evaluations on train and validation actions (published: 25 updates)."""
+    valid_episodes: int = 640
+    """Episodes per evaluation during training (published: 20 x 32)."""
+    eval_episodes: int = 5000
+    """Episodes of the final test (published: 5,000)."""
+    eval_available: int | None = None
+    """K at evaluation (default: num_available)."""
+
+    # The encoder, when a representation has to be made first
+    hvae_recipe: str = "laptop"
+    """Recipe of hvae.py."""
+    hvae_seed: int = 0
+    """Seed of the encoder; one table serves all policy seeds, as published."""
+
+    # The run
+    runs_dir: str = "runs"
+    """Where runs and representations live."""
+    run_name: str | None = None
+    """Default: <env>[-task]-<method>-s<seed>."""
+    resume: bool = False
+    """Go on from the run's checkpoint, bit for bit."""
+    overwrite: bool = False
+    """Throw away a run of the same name."""
+    device: str = "auto"
+    """auto | cpu | cuda."""
+    threads: int = 2
+    """CPU threads of the update."""
+    tensorboard: bool = True
+    """Write TensorBoard events."""
+
+
+# Table 3, one row per environment.
+PRESETS = {
+    "gridworld": Args(env="gridworld"),
+    "recsys": Args(
+        env="recsys",
+        representation="engineered",  # A.2: the environment provides the representations
+        ent_coef=0.01,
+        num_available=500,
+        minibatch_size=2048,
+        fixed_set_size=2000,  # published code: the set without subsampling, for its cost
+        eval_every=164_000,  # published code: every 20 updates of 8,192 steps
+        valid_episodes=160,  # published code: 20 x 8
+    ),
+    "create": Args(
+        env="create",
+        task="push",
+        ent_coef=0.005,
+        total_timesteps=60_000_000,
+        minibatch_size=3072,
+        lr_decay_steps=100_000_000,  # published code: the horizon is longer than the run
+        eval_every=615_000,  # published code: every 50 updates of 12,288 steps
+    ),
+    "stacking": Args(
+        env="stacking",
+        placement="1d",
+        ent_coef=0.01,
+        num_available=20,
+        total_timesteps=3_000_000,
+        minibatch_size=1024,
+        lr_decay_steps=100_000_000,  # published code
+        eval_every=102_400,  # published code: every 25 updates of 4,096 steps
+        valid_episodes=200,  # ours; published code: 40, too few to choose by
+    ),
+}
+
+# Our recipe: every difference from Tables 3-4, with its reason.
+FAST = {
+    "gridworld": dict(
+        one_hot=True,  # ids are names, not quantities: a linear layer can read one-hot cells
+        minibatch_size=1024,  # rollouts of 128 steps: four times as many updates per step
+        utility_gains=(1.0, math.sqrt(2), 0.01),  # 0.01 everywhere starves the gradient at first
+        total_timesteps=10_000_000,
+    ),
+    "recsys": dict(total_timesteps=10_000_000, utility_gains=(1.0, math.sqrt(2), 0.01)),
+    "create": dict(utility_gains=(1.0, math.sqrt(2), 0.01)),
+    "stacking": dict(utility_gains=(1.0, math.sqrt(2), 0.01)),
+}
+
+# --quick: the fast recipe with a smaller budget, never another algorithm.
+QUICK = {
+    "gridworld": dict(total_timesteps=4_000_000, hvae_recipe="quick"),
+    "recsys": dict(total_timesteps=500_000),
+    "create": dict(total_timesteps=400_000, hvae_recipe="quick", eval_episodes=500),
+    "stacking": dict(total_timesteps=40_000, hvae_recipe="quick", eval_episodes=200),
+}
+
+# The best score any policy of this kind can reach (oracle or exact search), to read results by.
+CEILINGS = {
+    "gridworld": 1.0,  # exact dynamic programming: every 50-subset but 1 in 7,000 is solvable
+    "recsys": 0.297,  # greedy on c alone; mu is hidden and the state holds no memory of clicks
+    "recsys-full": 0.664,  # greedy on c and mu, 500 on offer
+    "stacking": 5.4,  # a greedy flat tower; a plan, not a bound
+}
+
+
+# ---- D.3.2 the networks ----
+
+
+def layer_init(layer: nn.Linear, gain: float, generator: torch.Generator) -> nn.Linear:
+    """Orthogonal weights of the given gain, zero bias (published code)."""
+    nn.init.orthogonal_(layer.weight, gain, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class OneHotLinear(torch.autograd.Function):
+    """y = W onehot(ids) + b without building the one-hot vector in the forward pass.
+
+    A one-hot input only selects columns of W, so the product is a sum of table rows (embedding_bag,
+    5-10 times cheaper than the matrix product). The gradient of W *is* a matrix product with the
+    one-hot matrix, which is faster than scattering rows.
+    """
+
+    @staticmethod
+    def forward(ctx, index, weight_t):
+        ctx.save_for_backward(index)
+        ctx.num_rows = weight_t.shape[0]
+        return F.embedding_bag(index, weight_t, mode="sum")  # (B, cells) -> (B, out)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (index,) = ctx.saved_tensors
+        one_hot = grad.new_zeros(len(index), ctx.num_rows).scatter_(1, index, 1.0)
+        return None, one_hot.T @ grad  # (rows, B) @ (B, out)
+
+
+class StateEncoder(nn.Module):
+    """f_omega and the critic's trunk (D.3.2).
+
+    Vector states: two separate 2-layer tanh MLPs, one for the policy and one for the critic.
+    Image states: five stride-2 convolutions, a linear layer and ReLU, shared by both.
+    """
+
+    def __init__(self, space: gym.spaces.Box, args: Args, generator: torch.Generator):
+        super().__init__()
+        H, root2 = args.hidden_size, math.sqrt(2)  # gain sqrt(2): published code
+        self.is_image = len(space.shape) == 3
+        self.num_ids = int(space.high.max()) + 1 if args.one_hot else None
+        if self.is_image:
+            # 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side (published code; the appendix: 5 layers)
+            channels = [space.shape[0], 16, 16, 32, 32, 32]
+            convs = [
+                nn.Conv2d(i, o, 3, stride=2, padding=1)
+                for i, o in zip(channels, channels[1:], strict=False)
+            ]
+            for conv in convs:  # PyTorch's default distribution, drawn from our generator
+                nn.init.kaiming_uniform_(conv.weight, a=math.sqrt(5), generator=generator)
+                bound = 1 / math.sqrt(conv.weight[0].numel())
+                nn.init.uniform_(conv.bias, -bound, bound, generator=generator)
+            self.conv = nn.Sequential(*(m for c in convs for m in (c, nn.ReLU())), nn.Flatten())
+            self.project = layer_init(nn.Linear(32 * 3 * 3, H), root2, generator)
+            return
+        inputs = math.prod(space.shape) * (self.num_ids or 1)
+        self.actor_in = layer_init(nn.Linear(inputs, H), root2, generator)
+        self.critic_in = layer_init(nn.Linear(inputs, H), root2, generator)
+        self.actor_hidden = layer_init(nn.Linear(H, H), root2, generator)
+        self.critic_hidden = layer_init(nn.Linear(H, H), root2, generator)
+
+    def forward(self, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """State (B, ...) -> policy code (B, H) and critic code (B, H)."""
+        if self.is_image:
+            code = F.relu(self.project(self.conv(state / 255.0)))
+            return code, code
+        # Both nets read the same state, so their first layers run as one product of width 2H.
+        weight = torch.cat([self.actor_in.weight, self.critic_in.weight])  # (2H, inputs)
+        bias = torch.cat([self.actor_in.bias, self.critic_in.bias])
+        if self.num_ids:
+            cells = torch.arange(state.shape[1], device=state.device) * self.num_ids
+            first = OneHotLinear.apply(state.long() + cells, weight.T.contiguous()) + bias
+        else:
+            first = F.linear(state, weight, bias)
+        actor, critic = torch.tanh(first).chunk(2, dim=1)  # 2 x (B, H)
+        return torch.tanh(self.actor_hidden(actor)), torch.tanh(self.critic_hidden(critic))
+
+
+class FactorisedUtility(torch.autograd.Function):
+    """logits[b, k] = w . relu(u[b] + P[available[b, k]]), in cache-sized pieces.
+
+    The hidden layer of f_nu acts on the concatenation [state code; projected action], so its
+    product splits into W_s s + W_c (A c + a): a state part u, once per state, and an action part
+    P, once per action *of the whole table*. What is left per (state, action) pair is an addition,
+    a ReLU and a dot product: memory traffic. Two ideas keep that cheap:
+      - pieces of about 3 MB stay in the processor's cache through all their passes;
+      - the backward pass computes the hidden layer again instead of storing B*K*H numbers, and
+        writes in place (relu, sign, scale) what plain autograd would allocate each time.
+    tests/ hold the plain concatenation as its oracle.
+    """
+
+    @staticmethod
+    def hidden(u, P, available):
+        """relu(u + P[available]) of one piece: (b, H), (A, H), (b, K) -> (b, K, H)."""
+        b, K = available.shape
+        x = P.index_select(0, available.reshape(-1)).view(b, K, -1)  # (b*K, H) -> (b, K, H)
+        return x.add_(u[:, None]).relu_()
+
+    @staticmethod
+    def forward(ctx, u, P, w, available, workers):
+        ctx.save_for_backward(u, P, w, available)
+        ctx.workers = workers
+        logits = u.new_empty(available.shape)  # (B, K)
+
+        def piece(rows):
+            logits[rows] = FactorisedUtility.hidden(u[rows], P, available[rows]) @ w
+
+        FactorisedUtility.run(piece, u, available, workers)
+        return logits
+
+    @staticmethod
+    def backward(ctx, grad):
+        u, P, w, available = ctx.saved_tensors
+        grad_u = torch.empty_like(u)
+        H = u.shape[1]
+
+        def piece(rows, dP, dw):
+            g = grad[rows]  # (b, K)
+            x = FactorisedUtility.hidden(u[rows], P, available[rows])  # (b, K, H)
+            dw += g.reshape(-1) @ x.view(-1, H)
+            active = x.sign_()  # 1 where the ReLU is open, else 0
+            grad_u[rows] = torch.bmm(g[:, None], active)[:, 0] * w  # (b,1,K) @ (b,K,H) -> (b,H)
+            active.mul_(g[..., None])
+            dP.index_add_(0, available[rows].reshape(-1), active.view(-1, H))
+
+        sums = FactorisedUtility.run(piece, u, available, ctx.workers, P, w)
+        grad_P, grad_w = (sum(parts) for parts in zip(*sums, strict=True))
+        return grad_u, grad_P * w, grad_w, None, None
+
+    @staticmethod
+    def run(piece, u, available, workers, *like):
+        """Call piece(rows, *accumulators) over all rows; each worker has its own accumulators.
+
+        Workers are plain Python threads: torch releases the interpreter lock inside an operation.
+        Rows are shared out in a fixed way and the sums are added in a fixed order, so a run with
+        the same number of workers gives the same bits.
+        """
+        B, K = available.shape
+        rows = max(1, 800_000 // (K * u.shape[1])) if u.device.type == "cpu" else B
+        pieces = [slice(i, min(i + rows, B)) for i in range(0, B, rows)]
+        shares = [s for s in (pieces[i :: workers.count] for i in range(workers.count)) if s]
+
+        @torch.no_grad()  # gradient mode is per thread, and the pool's threads start with it on
+        def work(share):
+            sums = [torch.zeros_like(t) for t in like]
+            for part in share:
+                piece(part, *sums)
+            return sums
+
+        return [work(shares[0])] if len(shares) == 1 else list(workers.pool.map(work, shares))
+
+
+class Workers:
+    """A fixed number of threads for FactorisedUtility (1: no threads at all)."""
+
+    def __init__(self, count: int):
+        self.count = count
+        # torch's own thread count is per calling thread: one each, so that the pool never nests.
+        self.pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
+
+
+class Agent(nn.Module):
+    """State encoder, critic, utility (or a baseline's head) and auxiliary heads.
+
+    `table` (A, D) holds one fixed representation per action of the whole action set; it is never
+    trained by RL. `train_ids` gives the nearest-neighbour baseline's outputs their meaning.
+    """
+
+    def __init__(self, obs_space, action_space, table, train_ids, args: Args, workers: Workers):
+        super().__init__()
+        generator = torch.Generator().manual_seed(args.seed)
+        self.method, self.aux_ent_scale, self.workers = args.method, args.aux_ent_scale, workers
+        self.register_buffer("table", torch.as_tensor(table, dtype=torch.float32))  # (A, D)
+        self.register_buffer("train_ids", torch.as_tensor(train_ids))
+        H, D = args.hidden_size, table.shape[1]
+        W = args.utility_hidden or H
+        self.encoder = StateEncoder(obs_space["state"], args, generator)
+        self.critic = layer_init(nn.Linear(H, 1), math.sqrt(2), generator)
+        if self.method == "utility":
+            project, hidden, out = args.utility_gains
+            self.action_project = layer_init(nn.Linear(D, H), project, generator)
+            self.utility_hidden = layer_init(nn.Linear(2 * H, W), hidden, generator)
+            self.utility_out = layer_init(nn.Linear(W, 1), out, generator)
+        elif self.method == "nearest-neighbor":  # one logit per *training* action
+            self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01, generator)
+        else:  # continuous output: a Gaussian in representation space
+            self.head_mean = layer_init(nn.Linear(H, D), 1.0, generator)
+            self.head_var = layer_init(nn.Linear(H, D), 1.0, generator)
+        heads = action_space.spaces if isinstance(action_space, gym.spaces.Dict) else {}
+        self.has_position, self.has_stop = "position" in heads, "stop" in heads
+        if self.has_position:
+            d = heads["position"].shape[-1]
+            self.fc_alpha = layer_init(nn.Linear(H, d), 1.0, generator)
+            self.fc_beta = layer_init(nn.Linear(H, d), 1.0, generator)
+        if self.has_stop:
+            self.fc_stop = layer_init(nn.Linear(H, 2), 0.01, generator)
+
+    def encode(self, state):
+        """State (B, ...) -> code (B, H) and value (B,)."""
+        code, critic_code = self.encoder(state)
+        return code, self.critic(critic_code)[:, 0]
+
+    def project_actions(self):
+        """P (A, H): the action half of the utility's hidden layer, for every action there is.
+
+        Depends on the parameters only: once per rollout when acting, once per minibatch when
+        learning. D.3.2: c -> linear -> concatenate -> 2-layer MLP; no non-linearity in between.
+        """
+        if self.method != "utility":
+            return None
+        H = self.action_project.out_features
+        W_c = self.utility_hidden.weight[:, H:]  # (W, H): the columns that see the action
+        return self.action_project(self.table) @ W_c.T + self.utility_hidden.bias  # (A, W)
+
+    def choice_logits(self, code, available, P):
+        """Logits over the K actions on offer, (B, K) [nearest neighbour: training actions]."""
+        if self.method == "nearest-neighbor":
+            return self.head(code)  # (B, N_train)
+        H = self.action_project.out_features
+        u = code @ self.utility_hidden.weight[:, :H].T  # (B, W): the columns that see the state
+        w = self.utility_out.weight[0]
+        if torch.is_grad_enabled():
+            logits = FactorisedUtility.apply(u, P, w, available, self.workers)
+        else:
+            logits = FactorisedUtility.hidden(u, P, available) @ w
+        return logits + self.utility_out.bias
+
+    def gaussian(self, code):
+        """Continuous output: mean and std (B, D) of the wished-for representation."""
+        return self.head_mean(code), F.softplus(self.head_var(code)).sqrt()
+
+    def nearest(self, wish, available):
+        """Slot of the action on offer whose representation is nearest: (B, D), (B, K) -> (B,)."""
+        offered = self.table[available]  # (B, K, D)
+        return (offered - wish[:, None]).square().sum(-1).argmin(1)
+
+    def auxiliary(self, code, noise=None, action=None):
+        """f_chi: position ~ Beta on [-1, 1] per dimension, stop ~ Categorical(2).
+
+        Draws them when `action` is None. Returns the heads' values, summed log-probability (B,)
+        and entropy (B,), the position's scaled by `aux_ent_scale`.
+        """
+        out, logprob, entropy = {}, 0.0, 0.0
+        if self.has_position:
+            # alpha, beta >= 1: a single peak, never piled up at both borders (D.3.2)
+            alpha, beta = 1 + F.softplus(self.fc_alpha(code)), 1 + F.softplus(self.fc_beta(code))
+            if action is None:
+                both = torch.stack([alpha, beta], dim=-1)  # (B, d, 2)
+                unit = torch._sample_dirichlet(both, noise)[..., 0]  # a Beta is a 2-way Dirichlet
+                out["position"] = 2 * unit - 1  # (B, d) in [-1, 1]
+            else:
+                out["position"] = action["position"]
+            dist = torch.distributions.Beta(alpha, beta, validate_args=False)
+            # float32 can round to the border, where the density may be zero or infinite.
+            unit = (0.5 + out["position"] / 2).clamp(1e-6, 1 - 1e-6)
+            logprob = logprob + dist.log_prob(unit).sum(1)
+            entropy = entropy + self.aux_ent_scale * dist.entropy().sum(1)
+        if self.has_stop:
+            logp = F.log_softmax(self.fc_stop(code), dim=1)  # (B, 2)
+            out["stop"] = sample(logp, noise) if action is None else action["stop"]
+            logprob = logprob + logp.gather(1, out["stop"][:, None])[:, 0]
+            entropy = entropy - (logp.exp() * logp).sum(1)
+        return out, logprob, entropy
+
+    @torch.no_grad()
+    def act(self, state, available, P, generator, greedy=False):
+        """Choose actions: (B, ...), (B, K) -> (action dict, log-probability (B,), value (B,)).
+
+        action["choice"] is a slot of `available`, what the environment executes. The baselines
+        also return what the policy gradient acts on: "head" (training-action index) or "wish" (a
+        point in representation space); turning it into a slot is then part of the environment.
+        """
+        code, value = self.encode(state)
+        action = {}
+        if self.method == "continuous":
+            mean, std = self.gaussian(code)
+            noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+            action["wish"] = mean if greedy else mean + std * noise
+            logprob = gaussian_logprob(action["wish"], mean, std)
+            action["choice"] = self.nearest(action["wish"], available)
+        else:
+            logp = F.log_softmax(self.choice_logits(code, available, P), dim=1)
+            choice = logp.argmax(1) if greedy else sample(logp, generator)
+            logprob = logp.gather(1, choice[:, None])[:, 0]
+            if self.method == "nearest-neighbor":
+                action["head"] = choice
+                choice = self.nearest(self.table[self.train_ids[choice]], available)
+            action["choice"] = choice
+        aux, aux_logprob, _ = self.auxiliary(code, generator)
+        return action | aux, logprob + aux_logprob, value
+
+    def logprob_entropy(self, code, available, action, P):
+        """Log-probability and entropy, each (B,), of stored actions under the current policy."""
+        if self.method == "continuous":
+            mean, std = self.gaussian(code)
+            logprob = gaussian_logprob(action["wish"], mean, std)
+            # Averaged over dimensions, so that the coefficient does not depend on D (published
+            # code: the sum in Grid World, the average elsewhere).
+            entropy = (0.5 + 0.5 * math.log(2 * math.pi) + std.log()).mean(1)
+        else:
+            logp = F.log_softmax(self.choice_logits(code, available, P), dim=1)  # (B, K)
+            taken = action["choice" if self.method == "utility" else "head"]
+            logprob = logp.gather(1, taken[:, None])[:, 0]
+            entropy = -(logp.exp() * logp).sum(1)
+        _, aux_logprob, aux_entropy = self.auxiliary(code, action=action)
+        return logprob + aux_logprob, entropy + aux_entropy
+
+
+def sample(logp: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """One draw per row from log-probabilities (B, K): the first of K exponential clocks to ring."""
+    return (logp.exp() / torch.empty_like(logp).exponential_(generator=generator)).argmax(1)
+
+
+def gaussian_logprob(x, mean, std):
+    """Diagonal Gaussian log-density summed over dimensions, clamped to +-1e5 (published code)."""
+    logp = -0.5 * ((x - mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)
+    return logp.sum(1).clamp(-1e5, 1e5)
+
+
+class RunningMeanStd:
+    """Mean and variance over a stream of batches (float64, parallel-variance formula).
+
+    Published code updates it every step; we update once per rollout, so that the policy that
+    collects is exactly the policy that learns (and it costs 1/T of the time).
+    """
+
+    def __init__(self, shape: tuple[int, ...] = ()):
+        self.mean, self.var, self.count = np.zeros(shape), np.ones(shape), 1e-4
+
+    def update(self, x: np.ndarray) -> None:
+        """Merge a batch (n, *shape)."""
+        n, delta = len(x), x.mean(0, dtype=np.float64) - self.mean
+        total = self.count + n
+        squares = self.var * self.count + x.var(0, dtype=np.float64) * n
+        self.var = (squares + delta**2 * self.count * n / total) / total
+        self.mean, self.count = self.mean + delta * n / total, total
+
+    def normalize(self, x: np.ndarray) -> np.ndarray:
+        """(x - mean) / std clipped to +-10, as float32 (eps and clip: published code)."""
+        return ((x - self.mean) / np.sqrt(self.var + 1e-8)).clip(-10, 10).astype(np.float32)
+
+    def state(self) -> dict:
+        """Plain tensors, for the checkpoint."""
+        return {k: torch.as_tensor(v) for k, v in vars(self).items()}
+
+    def load(self, state: dict) -> None:
+        """The inverse of `state`."""
+        for key, value in state.items():
+            setattr(self, key, value.numpy().copy() if value.ndim else value.item())
+
+
+# ---- environments, pools, representations ----
+
+
+def task_options(args: Args) -> dict:
+    """The options this environment's constructor takes, from the fields of Args."""
+    names = TASK_OPTIONS[args.env]
+    return {n: getattr(args, n) for n in names if getattr(args, n) is not None}
+
+
+def make_envs(args: Args, pool: np.ndarray, num_envs: int, num_available: int, seed: int):
+    """A vector environment that offers `num_available` actions of `pool` per episode."""
+    module = importlib.import_module(MODULES[args.env])
+    return module.make_vec(num_envs, pool, num_available, seed, **task_options(args))
+
+
+def action_pools(args: Args) -> tuple[dict[str, np.ndarray], np.ndarray, int]:
+    """The three pools of the split, the pool trained on and how many of it are on offer."""
+    module = importlib.import_module(MODULES[args.env])
+    pools = module.split_actions(args.split)
+    pool, num_available = pools["train"], args.num_available
+    # The nearest-neighbour baseline and the ablation see one fixed set in every episode.
+    fixed = args.method == "nearest-neighbor" or not args.subsample
+    if fixed:
+        size = args.fixed_set_size if args.method == "utility" else None
+        if size is not None and size < len(pool):
+            pool = np.sort(np.random.default_rng(42).choice(pool, size, replace=False))
+        num_available = len(pool)
+    if num_available > len(pool):
+        raise ValueError(
+            f"num_available {num_available} is more than the {len(pool)} training actions"
+        )
+    return pools, pool, num_available
+
+
+def load_table(args: Args, train_ids: np.ndarray) -> np.ndarray:
+    """The table of representations (A, D); trains the encoder first if it is not on disk.
+
+    Raises ValueError or FileNotFoundError when a named file is missing, broken or was made for
+    another environment, split or action set.
+    """
+    module = importlib.import_module(MODULES[args.env])
+    kind = args.representation
+    if kind.startswith("engineered"):
+        options = task_options(args)
+        if kind != "engineered":
+            options["variant"] = kind.removeprefix("engineered-")
+        known = signature(module.engineered_representations).parameters
+        table = module.engineered_representations(**{k: options[k] for k in options if k in known})
+        if "variant" in options and "variant" not in known:
+            raise ValueError(f"representation {kind!r}: {args.env} has only 'engineered'")
+    else:
+        import hvae  # only here: the recommender never needs it
+
+        path = Path(kind)
+        if kind in ("hvae", "hvae-all", "vae"):
+            hvae_args = hvae.Args(
+                env=args.env,
+                modality=args.modality,
+                hierarchical=kind != "vae",
+                train_on="all" if kind == "hvae-all" else "train",
+                split=args.split,
+                seed=args.hvae_seed,
+                recipe=args.hvae_recipe,
+                device=args.device,
+                runs_dir=args.runs_dir,
+            )
+            path = hvae.representation_path(hvae_args)
+            if not path.exists():
+                print(f"no representation at {path} yet: training the encoder first", flush=True)
+                hvae.train(hvae_args)
+        elif path.suffix != ".npz":
+            raise ValueError(
+                f"representation {kind!r} is not one of hvae, hvae-all, vae, engineered, "
+                "engineered-5d, or the path of an .npz file"
+            )
+        table = hvae.load_representation(path, args.env, args.split)["mean"]
+    if args.standardize:
+        table = (table - table[train_ids].mean(0)) / (table[train_ids].std(0) + 1e-8)
+    return np.ascontiguousarray(table, dtype=np.float32)
+
+
+class Preprocess:
+    """What the agent does to a state before its networks see it (section 2.1 of the protocol).
+
+    Vector states: one-hot ids stay ids; numbers are normalised by running statistics, which stand
+    still at evaluation. Image states stay uint8; the encoder divides by 255.
+    """
+
+    def __init__(self, space: gym.spaces.Box, args: Args):
+        self.raw = args.one_hot or len(space.shape) == 3 or not args.norm_obs
+        self.keep_dtype = args.one_hot or len(space.shape) == 3
+        self.stats = RunningMeanStd(space.shape)
+
+    def __call__(self, state: np.ndarray) -> torch.Tensor:
+        if self.raw:
+            return torch.as_tensor(state if self.keep_dtype else state.astype(np.float32))
+        return torch.as_tensor(self.stats.normalize(state))
+
+
+# ---- Algorithm 1: rollout, advantages, update ----
+
+
+def to_env(action: dict[str, torch.Tensor]):
+    """The part of an action the environment executes, as numpy (a dict only if it is hybrid)."""
+    parts = {k: v.cpu().numpy() for k, v in action.items() if k in ("choice", "position", "stop")}
+    return parts if len(parts) > 1 else parts["choice"]
+
+
+@torch.no_grad()
+def rollout(envs, obs, agent, preprocess, num_steps, generator, device, metric):
+    """Collect T steps from N environments.
+
+    Stores the ids on offer (T, N, K), never their representations: the update rebuilds the softmax
+    over the very set that was offered. Returns (batch of (T, N, ...) tensors, next observation,
+    list of (score, return, length) of the episodes that ended).
+    """
+    P = agent.project_actions()
+    steps, episodes = [], []
+    for _ in range(num_steps):
+        state, available = preprocess(obs["state"]), torch.as_tensor(obs["available"])
+        action, logprob, value = agent.act(state.to(device), available.to(device), P, generator)
+        raw = obs["state"]
+        obs, reward, terminated, truncated, infos = envs.step(to_env(action))
+        # Time limits count as ends: they are part of these tasks and short (published code).
+        done = terminated | truncated
+        step = dict(state=state, available=available, logprob=logprob, value=value, raw=raw)
+        steps.append(step | action | dict(reward=reward, done=done))
+        if done.any():
+            final, episode = infos["final_info"], infos["final_info"]["episode"]
+            episodes += zip(
+                final[metric][done], episode["r"][done], episode["l"][done], strict=True
+            )
+    batch = {
+        key: torch.stack([torch.as_tensor(s[key]) for s in steps])  # (T, N, ...)
+        for key in steps[0]
+        if key != "raw"
+    }
+    batch["raw"] = np.stack([s["raw"] for s in steps])  # (T, N, ...)
+    return batch, obs, episodes
+
+
+def gae(rewards, values, dones, next_value, gamma, lam):
+    """Generalised advantage estimation, backwards in time; all arrays (T, N) [next_value (N,)].
+
+    delta_t = r_t + gamma (1 - done_t) V_{t+1} - V_t
+    A_t = delta_t + gamma lam (1 - done_t) A_{t+1}
+    Here done_t says that *this* step ended the episode (CleanRL's dones are shifted by one).
+    """
+    advantages, last = np.zeros_like(rewards), np.zeros_like(next_value)
+    for t in reversed(range(len(rewards))):
+        alive = 1.0 - dones[t]
+        delta = rewards[t] + gamma * alive * next_value - values[t]
+        advantages[t] = last = delta + gamma * lam * alive * last
+        next_value = values[t]
+    return advantages
+
+
+class RewardScale:
+    """Divide rewards by the running std of the discounted return G <- gamma G + r (no mean)."""
+
+    def __init__(self, num_envs: int, gamma: float):
+        self.gamma, self.G, self.stats = gamma, np.zeros(num_envs), RunningMeanStd()
+
+    def __call__(self, rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
+        """Rewards and dones (T, N) -> scaled rewards (T, N), clipped to +-10."""
+        returns = np.empty_like(rewards)
+        for t in range(len(rewards)):
+            returns[t] = self.G = self.gamma * self.G + rewards[t]
+            self.G = self.G * (1.0 - dones[t])
+        self.stats.update(returns.reshape(-1))
+        return (rewards / np.sqrt(self.stats.var + 1e-8)).clip(-10, 10)
+
+
+def ppo_loss(agent, mb, P, args: Args):
+    """The clipped loss of one minibatch; returns (loss, dict of its parts)."""
+    code, value = agent.encode(mb["state"])
+    logprob, entropy = agent.logprob_entropy(code, mb["available"], mb, P)
+    ratio = (logprob - mb["logprob"]).exp()
+    clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+    pg_loss = -torch.min(ratio * mb["advantage"], clipped * mb["advantage"]).mean()
+    v_error = (value - mb["return"]).square()
+    if args.clip_vloss:  # on the raw value scale (published code)
+        v_near = mb["value"] + (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
+        v_error = torch.max(v_error, (v_near - mb["return"]).square())
+    v_loss = 0.5 * v_error.mean()
+    entropy = entropy.mean()
+    loss = pg_loss + args.vf_coef * v_loss - args.ent_coef * entropy
+    with torch.no_grad():
+        clip_fraction = ((ratio - 1).abs() > args.clip_coef).float().mean()
+    parts = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy, clip_fraction=clip_fraction)
+    return loss, {k: v.detach() for k, v in parts.items()}
+
+
+def update(agent, optimizer, batch, args: Args, generator, device):
+    """PPO's epochs over one rollout; returns the mean of each loss part over all minibatches."""
+    skip = ("raw", "reward", "done", "choice" if args.method != "utility" else "")
+    b = {k: v.flatten(0, 1).to(device) for k, v in batch.items() if k not in skip}  # (T*N, ...)
+    # Normalised once over the whole rollout: every epoch sees the same values (published code).
+    adv = b["advantage"]
+    b["advantage"] = (adv - adv.mean()) / (adv.std() + 1e-5)
+    size = len(adv) // args.num_minibatches
+    totals: dict[str, torch.Tensor] = {}
+    for _ in range(args.update_epochs):
+        permutation = torch.randperm(len(adv), generator=generator, device=device)
+        for start in range(0, size * args.num_minibatches, size):  # a rest is dropped
+            mb_inds = permutation[start : start + size]
+            mb = {k: v[mb_inds] for k, v in b.items()}
+            # The parameters changed, so the whole table is projected again: (A, H), cheap.
+            loss, parts = ppo_loss(agent, mb, agent.project_actions(), args)
+            optimizer.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            optimizer.step()
+            for key, part in parts.items():
+                totals[key] = totals.get(key, 0) + part
+    return {k: v.item() / (args.update_epochs * args.num_minibatches) for k, v in totals.items()}
+
+
+# ---- Algorithm 2: acting with new actions ----
+
+
+@torch.no_grad()
+def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=None, greedy=False):
+    """Score of the frozen policy on `episodes` episodes with actions of `pool`.
+
+    Actions are sampled, as published (greedy is an extra). Every environment plays the same number
+    of episodes: stopping at "the first so many to finish" would favour short ones.
+    Returns dict(score, stderr, episodes, return, length).
+    """
+    module = importlib.import_module(MODULES[args.env])
+    num_available = num_available or args.eval_available or args.num_available
+    num_envs = min(episodes, 40 if episodes >= 1000 else 32)  # published: 40 x 125, 32 x 20
+    quota = -(-episodes // num_envs)
+    device = agent.table.device
+    generator = torch.Generator(device).manual_seed(seed)
+    envs = make_envs(args, pool, num_envs, min(num_available, len(pool)), seed)
+    obs, _ = envs.reset(seed=seed)
+    P = agent.project_actions() if args.method == "utility" else None
+    played, results = np.zeros(num_envs, dtype=int), []
+    while (played < quota).any():
+        state, available = preprocess(obs["state"]), torch.as_tensor(obs["available"])
+        action, *_ = agent.act(state.to(device), available.to(device), P, generator, greedy)
+        obs, _, terminated, truncated, infos = envs.step(to_env(action))
+        done = terminated | truncated
+        for i in np.flatnonzero(done & (played < quota)):
+            final = infos["final_info"]
+            episode = final["episode"]
+            results.append((final[module.METRIC][i], episode["r"][i], episode["l"][i]))
+        played += done
+    envs.close()
+    score, returns, lengths = np.array(results, dtype=np.float64).T  # each (episodes,)
+    return {
+        "score": score.mean(),
+        "stderr": score.std() / math.sqrt(len(score)),
+        "episodes": len(score),
+        "return": returns.mean(),
+        "length": lengths.mean(),
+    }
+
+
+# ---- what a run leaves behind ----
+
+COLUMNS = (
+    "step seconds sps train_score valid_score episode_score episode_return episode_length "
+    "pg_loss v_loss entropy clip_fraction learning_rate"
+).split()
+
+
+def write_atomically(path: Path, write) -> None:
+    """Call write(temporary path) and rename: a reader never sees half a file."""
+    temporary = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def method_name(args: Args) -> str:
+    """The method's name in results/published_results.csv, so that the two files join."""
+    if args.method != "utility":
+        name = {"nearest-neighbor": "nearest_neighbor", "continuous": "continuous_output"}
+        return name[args.method]
+    if not args.subsample:
+        return "ours_no_subsampling"
+    if args.ent_coef == 0:
+        return "ours_no_entropy"
+    names = {"hvae-all": "oracle_encoder_all_actions", "vae": "non_hierarchical_vae"}
+    if args.representation in names:
+        return names[args.representation]
+    if args.representation.startswith("engineered") and args.env != "recsys":
+        return args.representation.replace("-", "_")
+    modality_is_default = args.modality is None or (
+        args.modality == importlib.import_module(MODULES[args.env]).MODALITIES[0]
+    )
+    return "ours" if modality_is_default else "ours_alternate_modality"
+
+
+def published_scores(args: Args) -> dict[str, float]:
+    """Published mean per phase of this method, {} where there is none."""
+    path = Path(__file__).parent / "results" / "published_results.csv"
+    env = args.env + ("_full" if args.fully_observable else "")
+    scores = {}
+    if path.exists():
+        for row in csv.DictReader(path.open()):
+            same_task = (row["task"] or None) in (args.task, None)
+            if row["env"] == env and same_task and row["method"] == method_name(args):
+                scores[row["phase"]] = float(row["mean"])
+    return scores
+
+
+def save_checkpoint(path: Path, agent, optimizer, generator, preprocess, scale, **plain) -> None:
+    """Everything needed to go on bit for bit: tensors and plain types only, no pickled objects."""
+    state = {
+        "agent": agent.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "generator": generator.get_state(),
+        "obs_stats": preprocess.stats.state(),
+        "reward_stats": scale.stats.state(),
+    }
+    write_atomically(path, lambda temporary: torch.save(state | plain, temporary))
+
+
+def load_checkpoint(path: Path, device) -> dict:
+    """Read a checkpoint without running any code in it; one clear line if that fails."""
+    if not path.exists():
+        raise FileNotFoundError(f"no checkpoint at {path}")
+    try:
+        checkpoint = torch.load(path, map_location=device, weights_only=True)
+        missing = {"agent", "obs_stats", "args"} - set(checkpoint)
+    except Exception as e:  # torch raises a dozen kinds for broken or foreign files
+        reason = str(e).strip().splitlines()[0][:100]
+        raise ValueError(f"{path} is not a checkpoint of this script ({reason})") from None
+    if missing:
+        raise ValueError(f"{path} is not a checkpoint of this script (no {sorted(missing)[0]!r})")
+    return checkpoint
+
+
+class MetricsFile:
+    """metrics.csv: one row per update, flushed at once; cut back to the checkpoint on resume."""
+
+    def __init__(self, path: Path, last_step: int):
+        self.path, rows = path, []
+        if last_step and path.exists():
+            lines = path.read_text().splitlines()[1:]
+            rows = [r for r in lines if r.count(",") == len(COLUMNS) - 1]
+            rows = [r for r in rows if int(r.split(",")[0]) <= last_step]
+        text = "\n".join([",".join(COLUMNS), *rows]) + "\n"
+        write_atomically(path, lambda temporary: temporary.write_text(text))
+        self.file = path.open("a")
+
+    def write(self, row: dict) -> None:
+        """Append one row; a missing or not-a-number value is an empty cell."""
+        cells = [row.get(c) for c in COLUMNS]
+        empty = [c is None or (isinstance(c, float) and math.isnan(c)) for c in cells]
+        text = [
+            "" if e else f"{c:.6g}" if isinstance(c, float) else str(c)
+            for c, e in zip(cells, empty, strict=True)
+        ]
+        self.file.write(",".join(text) + "\n")
+        self.file.flush()
+
+
+def plot_curve(metrics: Path, path: Path, metric: str, published: dict, ceiling) -> None:
+    """Train and validation score over steps, raw (not held at their maximum), as curve.png."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rows = [r for r in csv.DictReader(metrics.open()) if r["valid_score"]]
+    steps = [int(r["step"]) / 1e6 for r in rows]
+    figure, axis = plt.subplots(figsize=(6, 4))
+    for name, label in (("train_score", "training actions"), ("valid_score", "validation actions")):
+        axis.plot(steps, [float(r[name]) for r in rows], marker=".", label=label)
+    if ceiling is not None:
+        axis.axhline(ceiling, color="grey", lw=1, label="ceiling")
+    if "test" in published:
+        axis.axhline(
+            published["test"], color="grey", ls="--", lw=1, label="published, test actions"
+        )
+    axis.set(xlabel="environment steps (millions)", ylabel=metric, ylim=(0, None))
+    axis.legend(frameon=False)
+    figure.tight_layout()
+    write_atomically(path, lambda temporary: figure.savefig(temporary, format="png", dpi=120))
+    plt.close(figure)
+
+
+@torch.no_grad()
+def record_episode(agent, preprocess, args: Args, pool, path: Path) -> None:
+    """Play one episode with unseen actions and save it as a GIF (the best of a few, by return)."""
+    module = importlib.import_module(MODULES[args.env])
+    names = {"gridworld": "GridWorldEnv", "recsys": "RecSysEnv"}
+    make = getattr(module, names.get(args.env, args.env.capitalize() + "Env"))
+    K = min(args.eval_available or args.num_available, len(pool))
+    env = make(pool, K, render_mode="rgb_array", **task_options(args))
+    device, P = agent.table.device, agent.project_actions()
+    generator = torch.Generator(device).manual_seed(args.seed)
+    best = (-math.inf, [])
+    for attempt in range(5):
+        obs, _ = env.reset(seed=10_000 + args.seed + attempt)
+        frames, done, total = [env.render()], False, 0.0
+        while not done:
+            state = preprocess(obs["state"][None]).to(device)  # (1, ...)
+            available = torch.as_tensor(obs["available"])[None].to(device)  # (1, K)
+            action, *_ = agent.act(state, available, P, generator)
+            parts = to_env(action)
+            one = {k: v[0] for k, v in parts.items()} if isinstance(parts, dict) else parts[0]
+            obs, reward, terminated, truncated, _ = env.step(one)
+            frames += env.render_frames()
+            total, done = total + reward, terminated or truncated
+        if total > best[0]:
+            best = (total, frames)
+    env.close()
+    module.save_gif(path, best[1], fps=6)
+
+
+def print_table(results: dict, metric: str) -> None:
+    """The last thing on the screen: seen against unseen actions, published score, ceiling."""
+    print(f"\n{metric:10} {'ours':>16} {'published':>10} {'ceiling':>8}   ({results['method']})")
+    for phase, label in (("train", "seen"), ("valid", "validation"), ("test", "unseen")):
+        ours, published = results[phase], results["published"].get(phase)
+        print(
+            f"{label:10} {ours['score']:9.3f} ±{ours['stderr']:.3f}"
+            f" {'-' if published is None else format(published, '.3f'):>12}"
+            f" {'-' if results['ceiling'] is None else format(results['ceiling'], '.3f'):>8}"
+        )
+
+
+# ---- Algorithm 1: the training loop ----
+
+
+def check(args: Args) -> None:
+    """Refuse impossible settings with one line, before anything is written."""
+    positive = "num_available total_timesteps minibatch_size num_envs num_minibatches update_epochs"
+    for name in f"{positive} eval_every valid_episodes eval_episodes threads hidden_size".split():
+        if getattr(args, name) < 1:
+            raise ValueError(f"{name} {getattr(args, name)} is not allowed; at least 1")
+    if args.minibatch_size * args.num_minibatches % args.num_envs:
+        raise ValueError(
+            f"minibatch_size {args.minibatch_size} x num_minibatches {args.num_minibatches} is not "
+            f"a multiple of num_envs {args.num_envs}"
+        )
+    if args.ent_coef < 0 or args.learning_rate <= 0:
+        raise ValueError("ent_coef must be at least 0 and learning_rate above 0")
+    if args.task is not None and "task" not in TASK_OPTIONS[args.env]:
+        raise ValueError(f"task {args.task!r}: {args.env} has no tasks")
+    for name in ("fully_observable", "placement"):
+        if getattr(args, name) and name not in TASK_OPTIONS[args.env]:
+            raise ValueError(f"{name} is not an option of {args.env}")
+    if args.device not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"device {args.device!r} is not one of auto, cpu, cuda")
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device 'cuda': no CUDA device is available here")
+
+
+def run_path(args: Args) -> Path:
+    """runs/<env>[-task]-<method>-s<seed>, or what --run-name says."""
+    task = f"-{args.task}" if args.task else ""
+    return Path(args.runs_dir) / (
+        args.run_name or f"{args.env}{task}-{method_name(args)}-s{args.seed}"
+    )
+
+
+def open_run(args: Args, device) -> tuple[Path, dict | None]:
+    """Make the run's folder, or find the checkpoint to go on from."""
+    folder = run_path(args)
+    if args.resume and (folder / "checkpoint.pt").exists():
+        checkpoint = load_checkpoint(folder / "checkpoint.pt", device)
+        free = {"resume", "overwrite", "threads", "device", "tensorboard", "runs_dir", "run_name"}
+        for f in fields(Args):  # a run continues as what it was
+            ours, theirs = getattr(args, f.name), checkpoint["args"].get(f.name)
+            ours = list(ours) if isinstance(ours, tuple) else ours
+            if f.name not in free and ours != theirs:
+                raise ValueError(
+                    f"cannot resume {folder}: {f.name} is {theirs!r} there, {ours!r} here"
+                )
+        return folder, checkpoint
+    if folder.exists() and any(folder.iterdir()) and not args.resume:
+        if not args.overwrite:
+            raise ValueError(
+                f"{folder} already holds a run; --resume goes on with it, --overwrite replaces it"
+            )
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder, None
+
+
+def plain_args(args: Args) -> dict:
+    """Args as JSON-like values (tuples become lists)."""
+    return json.loads(json.dumps(asdict(args)))
+
+
+def seeds(args: Args, *path: int) -> int:
+    """An independent seed for each use (a stream of the run's seed), as a 31-bit number."""
+    return int(np.random.SeedSequence([args.seed, *path]).generate_state(1)[0] >> 1)
+
+
+class Run:
+    """One training run: pools, table, agent, optimiser, normalisers, files."""
+
+    def __init__(self, args: Args):
+        check(args)
+        self.args, self.module = args, importlib.import_module(MODULES[args.env])
+        has_cuda = torch.cuda.is_available()
+        self.device = torch.device(
+            ("cuda" if has_cuda else "cpu") if args.device == "auto" else args.device
+        )
+        self.pools, self.pool, self.num_available = action_pools(args)
+        self.batch_size = args.minibatch_size * args.num_minibatches  # T * N
+        self.num_steps = self.batch_size // args.num_envs  # T
+        self.num_updates = args.total_timesteps // self.batch_size
+        if self.num_updates < 1:
+            raise ValueError(
+                f"total_timesteps {args.total_timesteps} is less than one rollout of "
+                f"{self.batch_size} (minibatch_size x num_minibatches)"
+            )
+        self.folder, checkpoint = open_run(args, self.device)
+        self.envs = make_envs(args, self.pool, args.num_envs, self.num_available, seeds(args, 1, 0))
+        self.build(load_table(args, self.pools["train"]), checkpoint)
+
+    def build(self, table, checkpoint) -> None:
+        """Create (or restore) everything that learns."""
+        args = self.args
+        spaces = self.envs.single_observation_space, self.envs.single_action_space
+        if args.one_hot and not np.issubdtype(spaces[0]["state"].dtype, np.integer):
+            raise ValueError(f"one_hot needs integer states; those of {args.env} are not")
+        torch.set_num_threads(1)  # FactorisedUtility brings its own threads
+        self.preprocess = Preprocess(spaces[0]["state"], args)
+        workers = Workers(args.threads)
+        self.agent = Agent(*spaces, table, self.pool, args, workers).to(self.device)
+        decay = [p for n, p in self.agent.named_parameters() if "utility" in n or "action_p" in n]
+        rest = [
+            p for n, p in self.agent.named_parameters() if not ("utility" in n or "action_p" in n)
+        ]
+        groups = [{"params": decay, "weight_decay": args.weight_decay}, {"params": rest}]
+        self.optimizer = torch.optim.AdamW(
+            [g for g in groups if g["params"]],
+            lr=args.learning_rate,
+            eps=args.adam_eps,
+            weight_decay=0.0,  # AdamW without decay is Adam
+            fused=True,
+        )
+        self.generator = torch.Generator(self.device).manual_seed(seeds(args, 2))
+        self.scale = RewardScale(args.num_envs, args.gamma)
+        self.update_index, self.seconds, self.best_score = 0, 0.0, -math.inf
+        if checkpoint:
+            self.agent.load_state_dict(checkpoint["agent"])
+            self.optimizer.load_state_dict(checkpoint["optimizer"])
+            self.generator.set_state(checkpoint["generator"].cpu())
+            self.preprocess.stats.load(checkpoint["obs_stats"])
+            self.scale.stats.load(checkpoint["reward_stats"])
+            self.update_index = checkpoint["update_index"]
+            self.seconds, self.best_score = checkpoint["seconds"], checkpoint["best_score"]
+
+    def save(self, name: str) -> None:
+        """Write checkpoint.pt or best.pt."""
+        save_checkpoint(
+            self.folder / name,
+            self.agent,
+            self.optimizer,
+            self.generator,
+            self.preprocess,
+            self.scale,
+            update_index=self.update_index,
+            seconds=self.seconds,
+            best_score=self.best_score,
+            args=plain_args(self.args),
+        )
+
+    def score(self, phase: str, episodes: int, seed: int) -> dict:
+        """Evaluate on the actions of one phase; see section 4 of the protocol for K.
+
+        Methods trained on one fixed set are scored on that set in the "train" phase.
+        """
+        fixed = phase == "train" and self.num_available == len(self.pool)
+        pool = self.pool if phase == "train" else self.pools[phase]
+        K = len(pool) if fixed else None
+        return evaluate(self.agent, self.preprocess, self.args, pool, episodes, seed, K)
+
+
+def train(args: Args) -> dict:
+    """Algorithm 1 and the final test; returns what results.json holds."""
+    run = Run(args)
+    write_atomically(
+        run.folder / "args.json", lambda t: t.write_text(json.dumps(plain_args(args), indent=1))
+    )
+    metrics = MetricsFile(run.folder / "metrics.csv", run.update_index * run.batch_size)
+    writer = None
+    if args.tensorboard:
+        from torch.utils.tensorboard import SummaryWriter  # 1.5 s of import, so only here
+
+        writer = SummaryWriter(run.folder, purge_step=run.update_index * run.batch_size)
+    eval_every = max(1, args.eval_every // run.batch_size)  # in updates
+    lr_updates = (args.lr_decay_steps or args.total_timesteps) // run.batch_size
+    # Episodes start afresh at every checkpoint, killed or not, so a resumed run repeats exactly.
+    obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index))
+    bar = tqdm(
+        total=run.num_updates * run.batch_size,
+        initial=run.update_index * run.batch_size,
+        unit="step",
+        unit_scale=True,
+        desc=run.folder.name,
+        disable=None,  # silent when not a terminal
+    )
+    start, valid_score = time.perf_counter() - run.seconds, float("nan")
+    while run.update_index < run.num_updates:
+        began = time.perf_counter()
+        fraction = 1 - min(1.0, run.update_index / lr_updates)
+        lr = args.learning_rate * (args.lr_floor + (1 - args.lr_floor) * fraction)
+        for param_group in run.optimizer.param_groups:
+            param_group["lr"] = lr
+
+        # Collect, with a random subset of the training actions in every episode.
+        batch, obs, episodes = rollout(
+            run.envs, obs, run.agent, run.preprocess, run.num_steps, run.generator, run.device,
+            run.module.METRIC,
+        )  # fmt: skip
+
+        # Advantages, on rewards scaled for training only.
+        rewards, dones = batch["reward"].double().numpy(), batch["done"].numpy()  # (T, N)
+        if args.norm_reward and not run.agent.encoder.is_image:
+            rewards = run.scale(rewards, dones)
+        values = batch["value"].cpu().double().numpy()
+        with torch.no_grad():
+            next_value = run.agent.encode(run.preprocess(obs["state"]).to(run.device))[1]
+        next_value = next_value.cpu().double().numpy()  # (N,)
+        advantages = gae(rewards, values, dones, next_value, args.gamma, args.gae_lambda)
+        batch["advantage"] = torch.as_tensor(advantages, dtype=torch.float32)
+        batch["return"] = torch.as_tensor(advantages + values, dtype=torch.float32)
+
+        # Learn, then let the normaliser catch up with what was seen.
+        losses = update(run.agent, run.optimizer, batch, args, run.generator, run.device)
+        raw = batch["raw"]
+        if not run.preprocess.raw:
+            run.preprocess.stats.update(raw.reshape(-1, *raw.shape[2:]))
+        run.update_index += 1
+        step = run.update_index * run.batch_size
+        bar.update(run.batch_size)
+
+        scores, returns, lengths = (
+            np.array(episodes, float).T if episodes else np.full((3, 1), np.nan)
+        )
+        row = losses | {
+            "step": step,
+            "sps": run.batch_size / (time.perf_counter() - began),
+            "episode_score": float(scores.mean()),
+            "episode_return": float(returns.mean()),
+            "episode_length": float(lengths.mean()),
+            "learning_rate": lr,
+        }
+        at_end = run.update_index == run.num_updates
+        if run.update_index % eval_every == 0 or at_end:
+            for k, phase in enumerate(("train", "valid")):
+                seed = seeds(args, 3, run.update_index, k)
+                row[f"{phase}_score"] = float(run.score(phase, args.valid_episodes, seed)["score"])
+            valid_score = row["valid_score"]
+            bar.set_postfix(valid=f"{valid_score:.3f}", train=f"{row['train_score']:.3f}")
+        row["seconds"] = run.seconds = time.perf_counter() - start
+        metrics.write(row)
+        if writer:
+            for key, value in row.items():
+                writer.add_scalar(key, value, step)
+        if "valid_score" in row:
+            if valid_score > run.best_score:  # model selection, on validation actions only
+                run.best_score = valid_score
+                run.save("best.pt")
+            run.save("checkpoint.pt")
+            obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index))
+            run.scale.G[:] = 0.0
+    bar.close()
+    run.envs.close()
+    if writer:
+        writer.close()
+    return finish(run)
+
+
+def finish(run: Run) -> dict:
+    """Load the best checkpoint by validation score and test it once on the unseen actions."""
+    args, folder = run.args, run.folder
+    best = load_checkpoint(folder / "best.pt", run.device)
+    run.agent.load_state_dict(best["agent"])
+    run.preprocess.stats.load(best["obs_stats"])
+    results = {
+        phase: run.score(phase, args.eval_episodes, seeds(args, 4, k))
+        for k, phase in enumerate(("train", "valid", "test"))
+    }
+    ceiling = "recsys-full" if args.fully_observable else args.env
+    results |= {
+        "metric": run.module.METRIC,
+        "method": method_name(args),
+        "published": published_scores(args),
+        "ceiling": CEILINGS.get(ceiling),
+        "steps": run.num_updates * run.batch_size,
+        "best_step": best["update_index"] * run.batch_size,
+        "hours": run.seconds / 3600,
+        "seed": args.seed,
+        "command": "python " + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    }
+    write_atomically(folder / "results.json", lambda t: t.write_text(json.dumps(results, indent=1)))
+    plot_curve(
+        folder / "metrics.csv", folder / "curve.png", run.module.METRIC, results["published"],
+        results["ceiling"],
+    )  # fmt: skip
+    record_episode(run.agent, run.preprocess, args, run.pools["test"], folder / "episode.gif")
+    print_table(results, run.module.METRIC)
+    print(f"curve, episode, metrics and checkpoints: {folder}/")
+    return results
+
+
+# ---- command line ----
+
+
+@dataclass
+class EvaluateArgs:
+    """Score a finished run's best checkpoint on any of its action pools."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of the run."""
+    actions: Literal["train", "valid", "test"] = "test"
+    """Which actions are on offer."""
+    num_available: int | None = None
+    """K (default: the run's)."""
+    episodes: int = 5000
+    """Episodes to play."""
+    seed: int = 0
+    """Seed of environments and action sampling."""
+    greedy: bool = False
+    """Take the most probable action instead of sampling."""
+
+
+def evaluate_run(options: EvaluateArgs) -> dict:
+    """`python ppo_actiongen.py evaluate RUN ...`"""
+    checkpoint = load_checkpoint(Path(options.run) / "best.pt", "cpu")
+    saved = {f.name: checkpoint["args"][f.name] for f in fields(Args)}
+    saved["utility_gains"] = tuple(saved["utility_gains"])
+    args = Args(**saved)
+    pools, pool, _ = action_pools(args)
+    if options.actions != "train":
+        pool = pools[options.actions]
+    K = options.num_available or args.eval_available or args.num_available
+    if not 1 <= K <= len(pool) or options.episodes < 1:
+        raise ValueError(f"num_available {K} is not in 1..{len(pool)}, or episodes is below 1")
+    envs = make_envs(args, pool, 1, K, 0)
+    spaces = envs.single_observation_space, envs.single_action_space
+    table, train_ids = checkpoint["agent"]["table"].numpy(), checkpoint["agent"]["train_ids"]
+    agent = Agent(*spaces, table, train_ids.numpy(), args, Workers(1))
+    agent.load_state_dict(checkpoint["agent"])
+    preprocess = Preprocess(spaces[0]["state"], args)
+    preprocess.stats.load(checkpoint["obs_stats"])
+    result = evaluate(
+        agent, preprocess, args, pool, options.episodes, options.seed, K, options.greedy
+    )
+    print(f"{options.actions} actions, K={K}, {result['episodes']} episodes: ", end="")
+    print(f"{result['score']:.4f} ± {result['stderr']:.4f}")
+    return result
+
+
+def default_args(env: str, recipe: str, quick: bool) -> Args:
+    """Table 3's preset, then our recipe's differences, then the laptop budget."""
+    if env not in PRESETS:
+        raise ValueError(f"environment {env!r} is not one of {', '.join(PRESETS)}, evaluate")
+    if recipe not in ("fast", "paper"):
+        raise ValueError(f"recipe {recipe!r} is not one of fast, paper")
+    args = replace(PRESETS[env], recipe=recipe, quick=quick)
+    if recipe == "fast":
+        args = replace(args, **FAST[env])
+    return replace(args, **QUICK[env]) if quick else args
+
+
+def main() -> None:
+    """Read the command line; every field of Args is a flag, and explicit flags win over presets."""
+    if sys.version_info[:2] != (3, 11):
+        print(f"note: made for Python 3.11, this is {sys.version.split()[0]}", file=sys.stderr)
+    argv = sys.argv[1:]
+    usage = (
+        f"usage: ppo_actiongen.py {{{','.join(PRESETS)},evaluate}} [options]; see --help after one"
+    )
+    if not argv or argv[0].startswith("-"):
+        raise SystemExit(usage)
+    try:
+        if argv[0] == "evaluate":
+            evaluate_run(tyro.cli(EvaluateArgs, args=argv[1:]))
+            return
+        # The recipe decides the defaults that --help shows, so it is looked at first.
+        words = [w for a in argv for w in a.split("=")]
+        recipe = words[words.index("--recipe") + 1] if "--recipe" in words[:-1] else "fast"
+        default = default_args(argv[0], recipe, "--quick" in words)
+        train(tyro.cli(Args, args=argv[1:], default=default))
+    except (ValueError, FileNotFoundError) as e:
+        raise SystemExit(f"error: {e}") from None
+
+
+if __name__ == "__main__":
+    main()
