@@ -184,7 +184,7 @@ def action_observations(
     seed: int = 0,
     workers: int = 1,
 ) -> np.ndarray:
-    """Record skills in an empty 80x80 grid, each from `num_observations` random cells (A.1, Table 4).
+    """Record skills in an empty 80x80 grid from `num_observations` random cells (A.1, Table 4).
 
     Returns uint8 (len(action_ids), num_observations, 6, 2): the cell (x, y) before the skill and
     after each of its five moves, in cells, 1..78. E.g. skill UUURD from (3, 2): (3, 2) (3, 1)
@@ -231,7 +231,7 @@ def _check_ids(ids: np.ndarray) -> np.ndarray:
 
 
 def _check_pool(action_pool: np.ndarray | None, num_available: int) -> np.ndarray:
-    """The pool in ascending order (default: training skills); ValueError when it is unusable."""
+    """Pool in ascending order (default: training skills); ValueError when it is unusable."""
     pool = np.sort(_check_ids(split_actions()["train"] if action_pool is None else action_pool))
     if (repeated := pool[1:][pool[1:] == pool[:-1]]).size:
         raise ValueError(f"action id {repeated[0]} is in the pool twice; allowed: once")
@@ -625,11 +625,13 @@ def _draw_caption(draw, position, grid, skill, done: int, moves: int) -> None:
         _text(draw, left + key / 2, top + key / 2, letter, color, 19, "mm")
     kind = grid[position[0] * SIZE + position[1]]
     words = {SUBGOAL: "subgoal", GOAL: "goal reached", LAVA: "lava"}
-    word = words.get(kind, "out of moves" if moves >= MAX_MOVES else "")
+    word, color = words.get(kind, ""), COLORS[kind]
+    if moves >= MAX_MOVES and kind not in (GOAL, LAVA):
+        word, color = "out of moves", TEXT
     right = (SIZE * CELL - 14) * FINE
     middle = top + key / 2
     _text(draw, right, middle - 9 * FINE, f"move {moves} / {MAX_MOVES}", TEXT, 15, "rm")
-    _text(draw, right, middle + 10 * FINE, word, COLORS.get(kind if word else 0, TEXT), 15, "rm")
+    _text(draw, right, middle + 10 * FINE, word, color, 15, "rm")
 
 
 def _text(draw, x: float, y: float, text: str, color: str, size: int, anchor: str) -> None:
@@ -661,3 +663,151 @@ def save_gif(path: str | Path, frames: list[np.ndarray], fps: float) -> None:
             file, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0
         )
     os.replace(temporary, path)
+
+
+# ---- what can be reached, and the script ----
+
+
+def best_plan(layout: int, available: np.ndarray) -> tuple[float, list[int]]:
+    """Best return with the skills `available`, and the positions in it to choose one after another.
+
+    The plan is empty when the goal is out of reach; the return is then 0.1 or 0. Breadth first: all
+    cells reached with one skill, then with two, ... A skill that ends no episode makes five moves,
+    so the first number of skills that allows the goal also holds the shortest way there.
+    """
+    effects = skill_effects()[layout][:, available]  # (81, K, 5)
+    plans: dict[int, list[int]] = {START[0] * SIZE + START[1]: []}  # cell -> how to get there
+    frontier, subgoal_seen = list(plans), False
+    for skills_before in range(MAX_SKILLS):
+        finishes, following = [], []
+        for cell in frontier:
+            after, moves, subgoal, goal, lava = effects[cell].T  # (K,) each
+            subgoal_seen |= bool(subgoal.any())
+            finishes += [(moves[i], plans[cell] + [int(i)]) for i in goal.nonzero()[0]]
+            for i in (lava == 0).nonzero()[0]:
+                if int(after[i]) not in plans:
+                    plans[int(after[i])] = plans[cell] + [int(i)]
+                    following.append(int(after[i]))
+        if finishes:
+            moves, plan = min(finishes)
+            return LAMBDA_SUBGOAL + goal_reward(skills_before * SKILL_LENGTH + int(moves)), plan
+        frontier = following
+    return LAMBDA_SUBGOAL * subgoal_seen, []
+
+
+@dataclass
+class Args:
+    """Play one solved and one random episode, draw the action set, print a summary."""
+
+    seed: int = 0
+    """seed of the split, the layouts and the skills on offer"""
+    out: Path = Path("runs/demo")
+    """folder for the GIFs and the picture"""
+    pool: Literal["train", "valid", "test", "all"] = "test"
+    """skills to draw from"""
+    num_available: int = NUM_AVAILABLE
+    """skills on offer in an episode (Table 3)"""
+
+
+def _print_summary(args: Args, pool: np.ndarray) -> None:
+    labels, kinds = action_labels(), ("upper right", "lower right", "lower left", "upper left")
+    print(
+        f"{NUM_ACTIONS} skills of {SKILL_LENGTH} moves, {len(LAYOUTS)} layouts; split {args.seed}:"
+    )
+    print(f"  {'':6} skills  {'  '.join(kinds)}")
+    for name, ids in split_actions(seed=args.seed).items():
+        counts = [f"{(labels[ids] == kind).sum():{len(kind)}}" for kind in kinds]
+        print(f"  {name:6} {len(ids):6}  {'  '.join(counts)}")
+    best = [best_plan(layout, np.arange(NUM_ACTIONS))[0] for layout in range(len(LAYOUTS))]
+    print(f"best return with all skills: {min(best):.3f} to {max(best):.3f} over the layouts")
+    rng, sets = np.random.default_rng(args.seed), 20  # ours: 840 searches, half a second
+    draws = [rng.choice(pool, args.num_available, replace=False) for _ in range(sets)]
+    found = [best_plan(layout, ids) for ids in draws for layout in range(len(LAYOUTS))]
+    solved = np.mean([len(plan) > 0 for _, plan in found])
+    print(f"{args.num_available} of the {len(pool)} skills of {args.pool!r}:")
+    print(f"  best possible  success {solved:.3f}  return {np.mean([r for r, _ in found]):.3f}")
+    envs, wins, returns = make_vec(256, pool, args.num_available, args.seed), [], []
+    envs.reset()
+    for _ in range(400):
+        infos = envs.step(rng.integers(args.num_available, size=envs.num_envs))[-1]
+        if infos:
+            over, info = infos["_final_info"], infos["final_info"]
+            wins.extend(info[METRIC][over])
+            returns.extend(info["episode"]["r"][over])
+    print(f"  random choice  success {np.mean(wins):.3f}  return {np.mean(returns):.3f}")
+
+
+def _draw_sheet(path: Path, pool: np.ndarray, seed: int) -> None:
+    """One picture: the 42 layouts, skills of the pool by quadrant, recordings in the play world."""
+    import matplotlib.pyplot as plt  # here: training needs no pictures
+
+    colors = {"upper right": "#d62728", "lower right": "#e0a106"}
+    colors |= {"lower left": "#1f77b4", "upper left": "#2ca02c"}
+    rng, labels = np.random.default_rng(seed), action_labels()
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(16, 5.7))
+    boards = [np.array(_board(i).reduce(2 * FINE))[: SIZE * CELL // 2] for i in range(len(LAYOUTS))]
+    boards = np.pad(boards, ((0, 0), (8, 8), (8, 8), (0, 0)), constant_values=255)
+    rows = np.split(boards, len(LAYOUTS) // len(OPENINGS))  # 6 of (7, height, width, 3)
+    left.imshow(np.concatenate([np.concatenate(row, axis=1) for row in rows]))
+    left.set_title("the 42 layouts")
+    shown = {kind: rng.permutation(pool[labels[pool] == kind])[:4] for kind in colors}
+    for row, (kind, skills) in enumerate(shown.items()):
+        for column, skill in enumerate(skills):
+            moves = SKILL_MOVES[skill]
+            steps = np.vstack([(0, 0), MOVE_DELTAS[moves].cumsum(0)])  # (6, 2)
+            turns_back = np.append(False, (moves[1:] - moves[:-1]) % 4 == 2)
+            lane = 0.25 * turns_back.cumsum()[:, None, None]  # the way back is drawn beside
+            line = (np.stack([steps[:-1], steps[1:]], axis=1) + lane).reshape(-1, 2)  # (10, 2)
+            x, y = (line - (line.min(0) + line.max(0)) / 2 + (7 * column, 8 * row)).T
+            middle.plot(x, y, "-", color=colors[kind], linewidth=2)
+            middle.plot(x[0], y[0], "o", color=colors[kind], markersize=8)
+            middle.plot(x[-1], y[-1], "s", color=colors[kind], markersize=6)
+            middle.text(7 * column, 8 * row + 4, skill_name(skill), ha="center", fontsize=9)
+    middle.set(xlim=(-3, 24), ylim=(29, -3), title="skills (dot: start, square: end) by quadrant")
+    for kind, skills in shown.items():
+        for steps in action_observations(skills[:1], 40, seed=seed).reshape(-1, 6, 2):
+            right.plot(*steps.T, color=colors[kind], linewidth=1.5)
+            right.plot(*steps[0], "o", color=colors[kind], markersize=3.5)
+    names = ", ".join(skill_name(skills[0]) for skills in shown.values() if len(skills))
+    right.set(xlim=(0, 79), ylim=(79, 0), title=f"recordings (80x80): {names}")
+    left.set_axis_off()
+    middle.set_axis_off()
+    middle.set_aspect("equal")
+    right.set_aspect("equal")
+    figure.subplots_adjust(0.01, 0.05, 0.99, 0.94, wspace=0.04)
+    temporary = path.with_name(path.name + ".part")
+    figure.savefig(temporary, format="png", dpi=100)
+    os.replace(temporary, path)
+
+
+def main(args: Args) -> None:
+    """What `python gridworld.py` does."""
+    pool = np.arange(NUM_ACTIONS)
+    if args.pool != "all":
+        pool = split_actions(seed=args.seed)[args.pool]
+    env = GridWorldEnv(pool, args.num_available, "rgb_array")
+    _print_summary(args, pool)
+    for seed in range(args.seed, args.seed + 100):  # with few skills on offer, few can be solved
+        observation, _ = env.reset(seed=seed)
+        plan = best_plan(env._layout, observation["available"])[1]
+        if plan:
+            steps = iter(plan)
+            frames, info = episode_frames(env, lambda _, steps=steps: next(steps), seed)
+            names = " ".join(skill_name(observation["available"][i]) for i in plan)
+            print(f"solved in {info['moves']} moves: {names}, return {info['episode']['r']:.3f}")
+            save_gif(args.out / "gridworld_solved.gif", frames, env.metadata["render_fps"])
+            break
+    else:
+        print("no solution with these skills in 100 episodes")
+    env.action_space.seed(args.seed)
+    frames, info = episode_frames(env, lambda _: int(env.action_space.sample()), args.seed)
+    save_gif(args.out / "gridworld_random.gif", frames, env.metadata["render_fps"])
+    _draw_sheet(args.out / "gridworld_sheet.png", pool, args.seed)
+    print(f"wrote {', '.join(sorted(str(path) for path in args.out.glob('gridworld_*')))}")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except (ValueError, FileNotFoundError) as error:
+        raise SystemExit(f"error: {error}") from None
