@@ -304,7 +304,7 @@ class StateEncoder(nn.Module):
         super().__init__()
         H, root2 = args.hidden_size, math.sqrt(2)  # gain sqrt(2): published code
         self.is_image = len(space.shape) == 3
-        self.num_ids = int(space.high.max()) + 1 if args.one_hot else None
+        self.num_ids = int(space.high.max()) + 1 if args.one_hot else None  # see Preprocess
         if self.is_image:
             # 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side (published code; the appendix: 5 layers)
             channels = [space.shape[0], 16, 16, 32, 32, 32]
@@ -319,9 +319,12 @@ class StateEncoder(nn.Module):
             self.conv = nn.Sequential(*(m for c in convs for m in (c, nn.ReLU())), nn.Flatten())
             self.project = layer_init(nn.Linear(32 * 3 * 3, H), root2, generator)
             return
+        # The first layers of both nets read the same state, so they are one matrix of width 2H,
+        # stored with one row per input: what OneHotLinear sums.
         inputs = math.prod(space.shape) * (self.num_ids or 1)
-        self.actor_in = layer_init(nn.Linear(inputs, H), root2, generator)
-        self.critic_in = layer_init(nn.Linear(inputs, H), root2, generator)
+        halves = [nn.init.orthogonal_(torch.empty(H, inputs), root2, generator) for _ in "ac"]
+        self.first = nn.Parameter(torch.cat(halves).T.contiguous())  # (inputs, 2H)
+        self.first_bias = nn.Parameter(torch.zeros(2 * H))
         self.actor_hidden = layer_init(nn.Linear(H, H), root2, generator)
         self.critic_hidden = layer_init(nn.Linear(H, H), root2, generator)
 
@@ -330,14 +333,11 @@ class StateEncoder(nn.Module):
         if self.is_image:
             code = F.relu(self.project(self.conv(state / 255.0)))
             return code, code
-        # Both nets read the same state, so their first layers run as one product of width 2H.
-        weight = torch.cat([self.actor_in.weight, self.critic_in.weight])  # (2H, inputs)
-        bias = torch.cat([self.actor_in.bias, self.critic_in.bias])
         if self.num_ids:
             cells = torch.arange(state.shape[1], device=state.device) * self.num_ids
-            first = OneHotLinear.apply(state.long() + cells, weight.T.contiguous()) + bias
+            first = OneHotLinear.apply(state + cells, self.first) + self.first_bias
         else:
-            first = F.linear(state, weight, bias)
+            first = torch.addmm(self.first_bias, state, self.first)  # (B, inputs) -> (B, 2H)
         actor, critic = torch.tanh(first).chunk(2, dim=1)  # 2 x (B, H)
         return torch.tanh(self.actor_hidden(actor)), torch.tanh(self.critic_hidden(critic))
 
@@ -432,7 +432,7 @@ class Agent(nn.Module):
     trained by RL. `train_ids` gives the nearest-neighbour baseline's outputs their meaning.
     """
 
-    def __init__(self, obs_space, action_space, table, train_ids, args: Args, workers: Workers):
+    def __init__(self, state_space, action_space, table, train_ids, args: Args, workers: Workers):
         super().__init__()
         generator = torch.Generator().manual_seed(args.seed)
         self.method, self.aux_ent_scale, self.workers = args.method, args.aux_ent_scale, workers
@@ -440,7 +440,7 @@ class Agent(nn.Module):
         self.register_buffer("train_ids", torch.as_tensor(train_ids))
         H, D = args.hidden_size, table.shape[1]
         W = args.utility_hidden or H
-        self.encoder = StateEncoder(obs_space["state"], args, generator)
+        self.encoder = StateEncoder(state_space, args, generator)
         self.critic = layer_init(nn.Linear(H, 1), math.sqrt(2), generator)
         if self.method == "utility":
             project, hidden, out = args.utility_gains
@@ -699,19 +699,44 @@ def load_table(args: Args, train_ids: np.ndarray) -> np.ndarray:
 class Preprocess:
     """What the agent does to a state before its networks see it (section 2.1 of the protocol).
 
-    Vector states: one-hot ids stay ids; numbers are normalised by running statistics, which stand
-    still at evaluation. Image states stay uint8; the encoder divides by 255.
+    Vector states: numbers are normalised by running statistics, which stand still at evaluation;
+    with `one_hot`, integer ids are renumbered 0, 1, 2, ... (Grid World uses 6 of the ids 0..11), so
+    that the one-hot vectors hold no entry that never occurs. Image states stay uint8.
+    `space` describes the result; `first_states` (N, ...) shows which ids there are.
     """
 
-    def __init__(self, space: gym.spaces.Box, args: Args):
-        self.raw = args.one_hot or len(space.shape) == 3 or not args.norm_obs
-        self.keep_dtype = args.one_hot or len(space.shape) == 3
-        self.stats = RunningMeanStd(space.shape)
+    def __init__(self, space: gym.spaces.Box, args: Args, first_states=None):
+        self.one_hot, self.is_image = args.one_hot, len(space.shape) == 3
+        self.normalizes = args.norm_obs and not (self.one_hot or self.is_image)
+        self.stats, self.space, self.ids = RunningMeanStd(space.shape), space, np.zeros(0, int)
+        if self.one_hot:
+            if not np.issubdtype(space.dtype, np.integer):
+                raise ValueError(f"one_hot needs integer states; these are {space.dtype}")
+            self.set_ids(np.unique(first_states))
+
+    def set_ids(self, ids: np.ndarray) -> None:
+        """Number the ids that occur; any other id would share number 0."""
+        self.ids, self.number = ids, np.zeros(256, dtype=np.int64)
+        self.number[ids] = np.arange(len(ids))
+        self.space = gym.spaces.Box(0, len(ids) - 1, self.space.shape, np.int64)
 
     def __call__(self, state: np.ndarray) -> torch.Tensor:
-        if self.raw:
-            return torch.as_tensor(state if self.keep_dtype else state.astype(np.float32))
-        return torch.as_tensor(self.stats.normalize(state))
+        if self.one_hot:
+            return torch.from_numpy(self.number[state])
+        if self.is_image:
+            return torch.as_tensor(state)
+        x = self.stats.normalize(state) if self.normalizes else state.astype(np.float32)
+        return torch.from_numpy(x)
+
+    def state(self) -> dict:
+        """Plain tensors, for the checkpoint."""
+        return self.stats.state() | {"ids": torch.as_tensor(self.ids)}
+
+    def load(self, state: dict) -> None:
+        """The inverse of `state`."""
+        self.stats.load({k: v for k, v in state.items() if k != "ids"})
+        if self.one_hot:
+            self.set_ids(state["ids"].numpy())
 
 
 # ---- Algorithm 1: rollout, advantages, update ----
@@ -932,7 +957,7 @@ def save_checkpoint(path: Path, agent, optimizer, generator, preprocess, scale, 
         "agent": agent.state_dict(),
         "optimizer": optimizer.state_dict(),
         "generator": generator.get_state(),
-        "obs_stats": preprocess.stats.state(),
+        "preprocess": preprocess.state(),
         "reward_stats": scale.stats.state(),
     }
     write_atomically(path, lambda temporary: torch.save(state | plain, temporary))
@@ -944,7 +969,7 @@ def load_checkpoint(path: Path, device) -> dict:
         raise FileNotFoundError(f"no checkpoint at {path}")
     try:
         checkpoint = torch.load(path, map_location=device, weights_only=True)
-        missing = {"agent", "obs_stats", "args"} - set(checkpoint)
+        missing = {"agent", "preprocess", "args"} - set(checkpoint)
     except Exception as e:  # torch raises a dozen kinds for broken or foreign files
         reason = str(e).strip().splitlines()[0][:100]
         raise ValueError(f"{path} is not a checkpoint of this script ({reason})") from None
@@ -1140,12 +1165,11 @@ class Run:
         """Create (or restore) everything that learns."""
         args = self.args
         spaces = self.envs.single_observation_space, self.envs.single_action_space
-        if args.one_hot and not np.issubdtype(spaces[0]["state"].dtype, np.integer):
-            raise ValueError(f"one_hot needs integer states; those of {args.env} are not")
-        torch.set_num_threads(1)  # FactorisedUtility brings its own threads
-        self.preprocess = Preprocess(spaces[0]["state"], args)
-        workers = Workers(args.threads)
-        self.agent = Agent(*spaces, table, self.pool, args, workers).to(self.device)
+        torch.set_num_threads(args.threads)
+        first_states = self.envs.reset(seed=seeds(args, 1, 0))[0]["state"]
+        self.preprocess = Preprocess(spaces[0]["state"], args, first_states)
+        parts = self.preprocess.space, spaces[1], table, self.pool, args, Workers(args.threads)
+        self.agent = Agent(*parts).to(self.device)
         decay = [p for n, p in self.agent.named_parameters() if "utility" in n or "action_p" in n]
         rest = [
             p for n, p in self.agent.named_parameters() if not ("utility" in n or "action_p" in n)
@@ -1165,7 +1189,7 @@ class Run:
             self.agent.load_state_dict(checkpoint["agent"])
             self.optimizer.load_state_dict(checkpoint["optimizer"])
             self.generator.set_state(checkpoint["generator"].cpu())
-            self.preprocess.stats.load(checkpoint["obs_stats"])
+            self.preprocess.load(checkpoint["preprocess"])
             self.scale.stats.load(checkpoint["reward_stats"])
             self.update_index = checkpoint["update_index"]
             self.seconds, self.best_score = checkpoint["seconds"], checkpoint["best_score"]
@@ -1248,8 +1272,8 @@ def train(args: Args) -> dict:
 
         # Learn, then let the normaliser catch up with what was seen.
         losses = update(run.agent, run.optimizer, batch, args, run.generator, run.device)
-        raw = batch["raw"]
-        if not run.preprocess.raw:
+        if run.preprocess.normalizes:
+            raw = batch["raw"]  # (T, N, ...)
             run.preprocess.stats.update(raw.reshape(-1, *raw.shape[2:]))
         run.update_index += 1
         step = run.update_index * run.batch_size
@@ -1297,7 +1321,7 @@ def finish(run: Run) -> dict:
     args, folder = run.args, run.folder
     best = load_checkpoint(folder / "best.pt", run.device)
     run.agent.load_state_dict(best["agent"])
-    run.preprocess.stats.load(best["obs_stats"])
+    run.preprocess.load(best["preprocess"])
     results = {
         phase: run.score(phase, args.eval_episodes, seeds(args, 4, k))
         for k, phase in enumerate(("train", "valid", "test"))
@@ -1360,11 +1384,11 @@ def evaluate_run(options: EvaluateArgs) -> dict:
         raise ValueError(f"num_available {K} is not in 1..{len(pool)}, or episodes is below 1")
     envs = make_envs(args, pool, 1, K, 0)
     spaces = envs.single_observation_space, envs.single_action_space
-    table, train_ids = checkpoint["agent"]["table"].numpy(), checkpoint["agent"]["train_ids"]
-    agent = Agent(*spaces, table, train_ids.numpy(), args, Workers(1))
+    preprocess = Preprocess(spaces[0]["state"], args, checkpoint["preprocess"]["ids"].numpy())
+    preprocess.load(checkpoint["preprocess"])
+    table, train_ids = (checkpoint["agent"][k].numpy() for k in ("table", "train_ids"))
+    agent = Agent(preprocess.space, spaces[1], table, train_ids, args, Workers(1))
     agent.load_state_dict(checkpoint["agent"])
-    preprocess = Preprocess(spaces[0]["state"], args)
-    preprocess.stats.load(checkpoint["obs_stats"])
     result = evaluate(
         agent, preprocess, args, pool, options.episodes, options.seed, K, options.greedy
     )
