@@ -10,7 +10,6 @@ the agent has to understand what a skill does from recordings of it (the "play w
     #...~...#     ~  lava: a whole row or column, here the column x = 4
     #...o...#     o  the opening (the subgoal), here y = 3
     #...~...#     G  goal, always at (7, 7)
-    #...~...#
     #...~...#     x grows to the right, y grows downwards, both 0..8
     #...~...#
     #...~..G#     e.g. skill DDRRR then RRRDD then DDDDD: subgoal at move 5, goal at move 12

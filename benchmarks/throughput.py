@@ -37,6 +37,39 @@ def rate(work: Callable[[], int], seconds: float = 2.0) -> float:
 # ---- groups (one function per environment or algorithm) ----
 
 
+@group
+def gridworld() -> Iterator[Row]:
+    """Environment alone: skills per second under a random policy, episodes restarting by themselves."""
+    import gymnasium as gym
+    import numpy as np
+
+    import gridworld as grid
+
+    def steps(envs: gym.vector.VectorEnv, k: int) -> float:
+        actions = np.random.default_rng(0).integers(k, size=(256, envs.num_envs))
+        envs.reset()
+        return rate(lambda: sum(len(envs.step(row)[1]) for row in actions))
+
+    pools, published = grid.split_actions(), "published environment, single, in process"
+    for num_envs, k, role in (
+        (32, 50, "train"),
+        (32, 50, "test"),
+        (32, 512, "train"),
+        (1024, 50, "train"),
+    ):
+        envs = grid.make_vec(num_envs, pools[role], k, seed=0)
+        what = f"Grid World, tables, {num_envs} envs, {k} of {len(pools[role])} skills"
+        yield what, steps(envs, k), "skills/s", "480", published
+    envs = gym.vector.SyncVectorEnv([grid.GridWorldEnv] * 32, autoreset_mode="SameStep")
+    what = "Grid World, move by move, 32 envs in SyncVectorEnv"
+    yield what, steps(envs, 50), "skills/s", "480", published
+
+    def record() -> int:
+        return grid.action_observations(np.arange(grid.NUM_ACTIONS)).shape[0] * 1024
+
+    yield "Grid World, recordings in the 80x80 grid", rate(record), "recordings/s", "-", ""
+
+
 def main() -> None:
     """Run the groups named on the command line (default: all) and print one table."""
     names = sys.argv[1:] or list(GROUPS)
