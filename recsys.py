@@ -629,15 +629,17 @@ def draw_timeline(timeline: list[tuple | None], ending: str = "") -> np.ndarray:
     axes.vlines(x, 0, p, color="#dddddd", linewidth=1, zorder=1)
     axes.plot(x[~clicked], p[~clicked], "o", mfc="white", mec="#444444", markersize=4.5)
     axes.plot(x[clicked], p[clicked], "o", color="#d62728", markersize=6)
+    axes.axhline(click_probability(1e3), color="black", linewidth=0.8, linestyle=":")  # the limit
     axes.set(ylim=(0, 0.78), ylabel="click probability")
     rate = clicked.cumsum() / np.arange(1, len(p) + 1)
     lower.plot(x, rate, color="#d62728", linewidth=1.8)
     length = max(60, 20 * -(-len(timeline) // 20))  # ours: the axis grows in steps of 20 events
-    lower.set(xlim=(0, length), ylim=(0, 1), yticks=(0, 0.5, 1), ylabel="CTR so far")
+    lower.set(xlim=(0, length), ylim=(0, 1.05), yticks=(0, 0.5, 1), ylabel="CTR so far")
     lower.set_xlabel("events of this user: page views (shaded) and recommendations (dots)")
     if ending:
         axes.axvline(len(timeline), color="black", linewidth=1.2)
-        axes.text(len(timeline) - 0.4, 0.745, ending, ha="right", va="center", fontsize=9)
+        at = {"xytext": (-5, 0), "textcoords": "offset points", "ha": "right", "va": "center"}
+        axes.annotate(ending, (len(timeline), 0.755), fontsize=9, **at)
     _timeline_caption(figure, len(p), int(clicked.sum()))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
@@ -680,59 +682,64 @@ def save_gif(path: str | Path, frames: list[np.ndarray], fps: float) -> None:
 
 
 def draw_click_curve(path: Path, pool: np.ndarray, num_available: int, seed: int) -> None:
-    """Left: Eq. 2 and where the products of 2,000 users lie on it. Right: one user's choice."""
+    """Left: Eq. 2, and where the products lie on it. Right: the products as one user sees them."""
     import matplotlib.pyplot as plt
 
     rng = np.random.default_rng(seed)
     users = rng.standard_normal((2000, DIM))  # ours: enough for a smooth histogram
-    c, mu = product_vectors()[pool], product_bias()[pool]
-    taste = users @ c.T  # (2000, 16) @ (16, pool) -> (2000, pool)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 5), layout="constrained")
-    x = np.linspace(-12, 12, 400)
-    bars = left.twinx()
-    bars.hist((taste + mu).ravel(), 96, (-12, 12), density=True, color="#d9d9d9", zorder=0)
-    bars.set(ylim=(0, 0.5), yticks=[], ylabel="share of user-product pairs (grey)")
-    left.set_zorder(bars.get_zorder() + 1)
-    left.patch.set_visible(False)
-    left.plot(x, click_probability(x), color="black", linewidth=2)
-    offers = np.array([rng.choice(len(pool), num_available, replace=False) for _ in users])
-    rows = np.arange(len(users))
-    offer_taste, offer_mu = taste[rows[:, None], offers], mu[offers]  # (2000, K)
-    picks = {
-        "oracle": (offer_taste + offer_mu).argmax(1),
-        "mu-only": offer_mu.argmax(1),
-        "c-only": offer_taste.argmax(1),
-    }
-    for name, pick in picks.items():
-        at = np.median(offer_taste[rows, pick] + offer_mu[rows, pick])
-        p = click_probability(at)
-        left.plot(at, p, "o", color=POLICY_COLORS[name], markersize=9)
-        place = {"oracle": (-8, 8), "mu-only": (-8, 6), "c-only": (-8, 8)}[name]
-        left.annotate(
-            f"{name} {p:.2f}", (at, p), place, textcoords="offset points", ha="right",
-            color=POLICY_COLORS[name], fontsize=11,
-        )  # fmt: skip
-    left.set(ylim=(0, 0.8), xlim=(-12, 12), ylabel="click probability f(x)")
-    left.set(xlabel="x = c . v + mu", title="Eq. 2, with the median pick of three policies")
-    scatter = right.scatter(
-        offer_taste[0], offer_mu[0], c=click_probability(offer_taste[0] + offer_mu[0]),
-        cmap="viridis", vmin=0, vmax=0.73, s=22,
-    )  # fmt: skip
-    for name, pick in picks.items():
-        x0, y0 = offer_taste[0, pick[0]], offer_mu[0, pick[0]]
-        right.plot(x0, y0, "o", mfc="none", mec=POLICY_COLORS[name], mew=2, markersize=13)
-        right.annotate(
-            name, (x0, y0), (10, 6), textcoords="offset points", color=POLICY_COLORS[name]
-        )
-    figure.colorbar(scatter, label="click probability", ax=right)
-    right.set(xlabel="taste c . v", ylabel="popularity mu (hidden)")
-    right.set(title=f"one user, {num_available} products on offer")
-    right.set_aspect("equal")
+    offers = np.array([rng.choice(pool, num_available, replace=False) for _ in users])  # (2000, K)
+    mu = product_bias()[offers]  # (2000, K)
+    taste = np.matmul(product_vectors()[offers], users[:, :, None])[:, :, 0]  # (2000, K)
+    picks = {"oracle": taste + mu, "mu-only": mu, "c-only": taste}
+    picks = {name: score.argmax(1) for name, score in picks.items()}  # each (2000,)
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(13, 5.2), width_ratios=(1.25, 1), layout="constrained"
+    )
+    _draw_curve(left, taste + mu, picks)
+    p = click_probability(taste[0] + mu[0])  # the first user
+    dots = right.scatter(taste[0], mu[0], c=p, cmap="viridis", vmin=0, vmax=0.73, s=20)
+    for product in sorted({int(pick[0]) for pick in picks.values()}):
+        names = [name for name, pick in picks.items() if pick[0] == product]
+        at, color = (taste[0, product], mu[0, product]), POLICY_COLORS[names[0]]
+        right.plot(*at, "o", mfc="none", mec=color, mew=2.5, markersize=13)
+        text = f"{' = '.join(names)}: {p[product]:.2f}"
+        right.annotate(text, at, (12, -4), textcoords="offset points", color=color, fontsize=11)
+    figure.colorbar(dots, label="click probability", ax=right)
+    right.set(xlim=(-11, 11), ylim=(-11, 11), xlabel="taste c . v", ylabel="popularity mu (hidden)")
+    right.set_title(f"one user, {num_available} products on offer: popularity outweighs taste")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")
     figure.savefig(temporary, format="png", dpi=100)
     os.replace(temporary, path)
     plt.close(figure)
+
+
+def _draw_curve(axes, x: np.ndarray, picks: dict[str, np.ndarray]) -> None:
+    """f(x), a histogram of x (users, K), and the average click probability of each policy."""
+    grid = np.linspace(-13, 13, 400)
+    bars = axes.twinx()
+    bars.hist(x.ravel(), 104, range=(-13, 13), density=True, color="#dcdcdc")
+    bars.set(ylim=(0, 0.5), yticks=[])
+    axes.set_zorder(bars.get_zorder() + 1)
+    axes.patch.set_visible(False)
+    limits = click_probability(np.array([-1e3, 1e3]))
+    for limit in limits:
+        axes.axhline(limit, color="black", linewidth=0.8, linestyle=":")
+        axes.annotate(f"limit {limit:.3f}", (-12.8, limit), (0, 4), textcoords="offset points")
+    axes.plot(grid, click_probability(grid), color="black", linewidth=2)
+    chosen = {name: x[np.arange(len(x)), pick] for name, pick in picks.items()} | {"random": x}
+    for name, values in chosen.items():
+        p = click_probability(values).mean()
+        at = np.interp(p, click_probability(grid), grid)
+        axes.plot(at, p, "o", color=POLICY_COLORS[name], markersize=9)
+        below = -16 if name == "mu-only" else 6  # the oracle's label is just above it
+        axes.annotate(
+            f"{name} {p:.2f}", (at, p), (-8, below), textcoords="offset points", ha="right",
+            color=POLICY_COLORS[name], fontsize=11,
+        )  # fmt: skip
+    axes.set(xlim=(-13, 13), ylim=(0, 0.8), xlabel="x = c . v + mu")
+    axes.set(ylabel="click probability f(x)")
+    axes.set_title("Eq. 2; average first click of each policy; grey: all products on offer")
 
 
 # ---- the script ----
@@ -770,6 +777,25 @@ def _print_summary(args: Args, pool: np.ndarray) -> None:
             print(f"  {num_available:9}  " + "  ".join(f"{cell:>15}" for cell in cells), flush=True)
 
 
+def play_episode(env: RecSysEnv, policy: str, seed: int, every: int = 0) -> tuple[list, dict]:
+    """One episode with a policy of POLICIES: (a picture per `every` steps, info of the last step).
+
+    With every = 0 nothing is drawn; else the first and the last moment are always among the
+    pictures.
+    """
+    rng, over, info = np.random.default_rng(seed), False, {}
+    env.reset(seed=seed)
+    frames = env.render_frames() if every else []
+    while not over:
+        c, mu = env.c[env.available], env.mu[env.available]  # (K, 16), (K,)
+        action = POLICIES[policy](env.user[None], c[None], mu[None], rng)[0]
+        _, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+        if every and (over or env.recommendations % every == 0):
+            frames += env.render_frames()
+    return frames, info
+
+
 def main(args: Args) -> None:
     """What `python recsys.py` does."""
     if args.episodes < 1:
@@ -777,18 +803,18 @@ def main(args: Args) -> None:
     pool = split_actions(seed=args.seed)[args.pool]
     env = RecSysEnv(pool, args.num_available, "rgb_array")
     _print_summary(args, pool)
-    rng, over, info = np.random.default_rng(args.seed), False, {}
-    env.reset(seed=args.seed)
-    frames = [env.render()]
-    while not over:
-        c, mu = env.c[env.available], env.mu[env.available]  # (K, 16), (K,)
-        action = POLICIES[args.policy](env.user[None], c[None], mu[None], rng)[0]
-        *_, terminated, truncated, info = env.step(action)
-        frames += env.render_frames()
-        over = terminated or truncated
-    print(f"{args.policy}: {info['clicks']} clicks in {info['recommendations']} recommendations")
+    seed = args.seed  # ours: one episode in four is over before 15 recommendations; not worth a GIF
+    while play_episode(env, args.policy, seed)[1]["recommendations"] < 30:
+        seed += 1
+    frames, info = play_episode(
+        env, args.policy, seed, every=3
+    )  # ours: a third of the drawing time
+    shown = f"{info['clicks']} clicks in {info['recommendations']} recommendations"
+    print(f"drawn: {args.policy}, user {seed}: {shown}")
     save_gif(args.out / "recsys_episode.gif", frames, env.metadata["render_fps"])
-    Image.fromarray(frames[-1]).save(args.out / "recsys_timeline.png")
+    temporary = args.out / "recsys_timeline.png.part"
+    Image.fromarray(frames[-1]).save(temporary, "PNG")
+    os.replace(temporary, args.out / "recsys_timeline.png")
     draw_click_curve(args.out / "recsys_click_curve.png", pool, args.num_available, args.seed)
     print(f"wrote {', '.join(sorted(str(path) for path in args.out.glob('recsys_*')))}")
 
