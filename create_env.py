@@ -606,7 +606,7 @@ class Thing:
     """One object in a scene: its table entry, its place (units), its pymunk parts."""
 
     __slots__ = ("tool", "kind", "x", "y", "shape", "body", "parts", "corners", "wants", "touched")
-    __slots__ += ("holder", "first_contact", "strokes")
+    __slots__ += ("holder", "first_contact", "shown")
 
     def __init__(self, tool: Tool, x: float, y: float):
         self.tool, self.kind, self.x, self.y = tool, KINDS[tool.kind], float(x), float(y)
@@ -622,10 +622,12 @@ class Thing:
         self.touched = False  # ... and whether it ever came; never cleared
         self.holder: Thing | None = None  # the bucket that holds this ball
         self.first_contact: int | None = None  # probe balls only: physics step of the first contact
-        self.strokes: tuple | None = None  # cached drawing, see `grey_strokes`
+        self.shown: tuple | None = None  # while a past moment is drawn: where it was then
 
     def pose(self) -> tuple[float, float, float]:
         """x, y (units) and angle (rad), now."""
+        if self.shown is not None:
+            return self.shown
         if self.body is None:
             return self.x, self.y, 0.0
         x, y = self.body.position
@@ -1060,7 +1062,9 @@ class CreateEnv(gymnasium.Env):
         self._goal_hit, self._target_hit = False, self._marker is None
         self._still, self._actions, self._return = 0, 0, 0.0
         self._over = False
-        self._trails = {id(ball): [] for ball in (self._target, self._marker) if ball is not None}
+        self._trails = [(ball, []) for ball in (self._target, self._marker) if ball is not None]
+        self._last = (TOOLS[NO_OP], (0.0, 0.0), Placement.NO_OP)
+        self._page = None
         self._snapshots = [self._poses()]
         self._frames = np.zeros((NUM_FRAMES, 84, 84), np.uint8)
         return self._observe(), {}
@@ -1107,7 +1111,9 @@ class CreateEnv(gymnasium.Env):
         choice, x, y = self._read(action)
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode is over (or none began): call reset()")
-        placement = self._place(TOOLS[self._available[choice]], x, y)
+        tool = TOOLS[self._available[choice]]
+        placement = self._place(tool, x, y)
+        self._last = tool, (x, y), placement
         self._simulate()
         self._actions += 1
         paid = self._settle()
@@ -1242,11 +1248,48 @@ class CreateEnv(gymnasium.Env):
 
     def _poses(self) -> list:
         """Where the moving things are; and one more point on the trails of the balls."""
-        poses = [(thing, thing.pose()) for thing in self._moving]
+        for ball, trail in self._trails:
+            trail.append(ball.pose()[:2])
+        return [(thing, thing.pose()) for thing in self._moving]
+
+    def render(self) -> np.ndarray | None:
+        """The scene now, in colour: uint8 (render_size, render_size, 3); None without render_mode."""
+        return self.render_frames()[-1] if self.render_mode else None
+
+    def render_frames(self) -> list[np.ndarray]:
+        """Pictures of the last step, every 8 physics steps: 5 of `render()`'s kind, 1 after a reset."""
+        if self.render_mode is None:
+            raise ValueError("render_frames needs CreateEnv(render_mode='rgb_array')")
+        still = [thing for thing in self._things if thing.body is None]
+        if self._page is None or self._page[0] != still:  # cached until something is placed
+            pen = blank_page(self.render_size)
+            for thing in still:
+                draw_thing(pen, thing)
+            self._page = still, pen.image
+        last = len(self._snapshots) - 1
+        return [self._draw(poses, k - last) for k, poses in enumerate(self._snapshots)]
+
+    def _draw(self, poses: list, age: int) -> np.ndarray:
+        """One picture; `age` 0 is now, -1 the snapshot before."""
+        pen = Pen(self.render_size, self._page[1].copy())
+        for ball, trail in self._trails:
+            draw_trail(pen, trail[: len(trail) + age], ball.kind.colour)
         for thing, pose in poses:
-            if id(thing) in self._trails:
-                self._trails[id(thing)].append(pose[:2])
-        return poses
+            thing.shown = pose
+            draw_thing(pen, thing)
+            thing.shown = None
+        tool, (x, y), placement = self._last
+        words, colour = OUTCOME[placement] if self._actions else ("", INK)
+        if placement >= Placement.BLOCKED_BY_TOOL:
+            x, y = (min(max(to_units(value), 2.0), WORLD - 2.0) for value in (x, y))
+            for sign in (-1, 1):
+                pen.line([(x - 1.6, y - 1.6 * sign), (x + 1.6, y + 1.6 * sign)], 0.8, colour)
+        if self._goal_hit and age == 0:
+            words = "goal!"
+            pen.disc(self._goal.pose()[:2], 7.5, None, "#5fd32a", 0.8)
+        name = tool.kind if self._actions else ""
+        draw_caption(pen, f"{self._actions}/{self.task.max_actions}  {name}", words, colour)
+        return pen.picture()
 
 
 def _screen_distance(a: tuple[float, float], b: tuple[float, float]) -> float:
@@ -1276,7 +1319,9 @@ def make_vec(
     """
     if num_envs < 1:
         raise ValueError(f"num_envs must be 1 or more, got {num_envs}")
-    CreateEnv(action_pool, num_available, **task_options)  # bad arguments fail here, not in a worker
+    CreateEnv(
+        action_pool, num_available, **task_options
+    )  # bad arguments fail here, not in a worker
 
     def make(index: int) -> CreateEnv:
         env = CreateEnv(action_pool, num_available, **task_options)
@@ -1352,7 +1397,9 @@ def action_observations(
     if modality == "state":
         return np.ascontiguousarray(states[..., :6])
     jobs = list(zip(ids.tolist(), states, strict=True))
-    videos = np.empty((len(ids), num_observations, PROBE_LENGTH, PROBE_VIDEO, PROBE_VIDEO), np.uint8)
+    videos = np.empty(
+        (len(ids), num_observations, PROBE_LENGTH, PROBE_VIDEO, PROBE_VIDEO), np.uint8
+    )
     for row, video in enumerate(_spread(_probe_video, jobs, workers, "probe videos")):
         videos[row] = video
     return videos
@@ -1379,7 +1426,16 @@ def _cached_states(ids, n: int, seed: int, workers: int, cache) -> np.ndarray:
     known: dict[int, np.ndarray] = {}
     path = None
     if cache is not None:
-        constants = (TOOLS, KINDS, GRAVITY, DT, SLEEP_TIME, PROBE_ATTEMPTS, PROBE_STEPS, PROBE_EVERY)
+        constants = (
+            TOOLS,
+            KINDS,
+            GRAVITY,
+            DT,
+            SLEEP_TIME,
+            PROBE_ATTEMPTS,
+            PROBE_STEPS,
+            PROBE_EVERY,
+        )
         constants += (PROBE_LENGTH, PROBE_SPEED, PROBE_AREA, PROBE_BALL, NO_OP_REACH, CELL, MUZZLE)
         fingerprint = repr((constants, pymunk.version, pymunk.chipmunk_version, n, seed))
         digest = hashlib.sha256(fingerprint.encode()).hexdigest()[:16]
@@ -1416,13 +1472,17 @@ def _probe_states(job: tuple[int, int, int]) -> np.ndarray:
         start = rng.uniform(-1.0, 1.0, (len(waiting), 2))
         gap = places[waiting] - start
         distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (waiting, 1) norm
-        speed = rng.uniform(0.6, 1.4, (len(waiting), 1)) * PROBE_SPEED * speed_factor * (1 + distance)
+        speed = (
+            rng.uniform(0.6, 1.4, (len(waiting), 1)) * PROBE_SPEED * speed_factor * (1 + distance)
+        )
         velocity = speed * gap / np.maximum(distance, 1e-9)
         states, contact = _launch(tool, places[waiting], start, velocity)
         # contact: physics step 1..90 of the first touch, 0 overlap at launch, 91 never
         last = attempt >= PROBE_ATTEMPTS - 1  # then a miss is kept, an overlap draws again
         done = (contact > 0) & ((contact <= PROBE_STEPS) | last)
-        first = -(-contact[done] // PROBE_EVERY) - 1  # index of the first state at or after the touch
+        first = (
+            -(-contact[done] // PROBE_EVERY) - 1
+        )  # index of the first state at or after the touch
         cut = np.where(contact[done] > PROBE_STEPS, 1, np.clip(first - 3, 0, 2))
         frames = cut[:, None] + np.arange(PROBE_LENGTH)  # (done, 7)
         result[waiting[done]] = states[done][np.arange(done.sum())[:, None], frames]
@@ -1525,3 +1585,419 @@ def _probe_video(job: tuple[int, np.ndarray]) -> np.ndarray:
             paint(canvas, grey_strokes(ball))
             picture[:] = canvas + 0.5
     return video
+
+
+# ---- pictures for people (Figures 3 and 7): the same scene, large and in colour ----
+
+SMOOTH = 3  # ours: drawn this many times too large, then averaged, which gives soft edges
+PAPER, GRID, INK = "#fdfcf8", "#f1efe8", "#3b3a44"
+WOOD, WOOD_EDGE = "#e0a35c", "#9c6b30"
+
+
+def _shade(colour: str, factor: float) -> tuple[int, int, int]:
+    """A colour made darker (factor < 1) or lighter (> 1, towards white at 2)."""
+    rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    if factor > 1:
+        return tuple(int(c + (255 - c) * (factor - 1)) for c in rgb)
+    return tuple(int(c * factor) for c in rgb)
+
+
+class Pen:
+    """Pillow with world units: y up, sizes in units, soft edges. `picture()` gives the pixels."""
+
+    def __init__(self, size: int, image: Image.Image | None = None):
+        self.size, self.scale = size, size * SMOOTH / WORLD
+        self.image = image or Image.new("RGB", (size * SMOOTH, size * SMOOTH), PAPER)
+        self.draw = ImageDraw.Draw(self.image, "RGBA")
+
+    def at(self, point) -> tuple[float, float]:
+        """World point -> pixel."""
+        return point[0] * self.scale, (WORLD - point[1]) * self.scale
+
+    def disc(self, centre, radius, fill, edge=None, width=0.35) -> None:
+        """Filled circle, perhaps with a rim inside it."""
+        x, y = self.at(centre)
+        r, w = radius * self.scale, round(width * self.scale)
+        self.draw.ellipse(
+            (x - r, y - r, x + r, y + r), fill=fill, outline=edge, width=w if edge else 0
+        )
+
+    def line(self, points, width, fill) -> None:
+        """Polyline with round joints and ends."""
+        pixels = [self.at(point) for point in points]
+        self.draw.line(pixels, fill=fill, width=max(1, round(width * self.scale)))
+        for point in points:
+            self.disc(point, width / 2, fill)
+
+    def poly(self, corners, fill, edge=None, width=0.5) -> None:
+        """Filled polygon, perhaps with a rim on its edges."""
+        self.draw.polygon([self.at(corner) for corner in corners], fill=fill)
+        if edge:
+            self.line([*corners, corners[0]], width, edge)
+
+    def text(self, point, words, height, fill, anchor="la") -> None:
+        """Words at a point; `height` in units."""
+        font = ImageFont.load_default(size=height * self.scale)
+        self.draw.text(self.at(point), words, fill=fill, font=font, anchor=anchor)
+
+    def picture(self) -> np.ndarray:
+        """The finished picture, uint8 (size, size, 3)."""
+        return np.asarray(self.image.reduce(SMOOTH)).copy()
+
+
+def _frame_of(thing: Thing, angle: float):
+    """Function (along, across) -> world point, in a frame at the thing's place turned by `angle`."""
+    x, y = thing.pose()[:2]
+    c, s = math.cos(angle), math.sin(angle)
+    return lambda u, v=0.0: (x + c * u - s * v, y + s * u + c * v)
+
+
+def _draw_bar(pen: Pen, thing: Thing) -> None:
+    """Ramps, floors, walls; trampolines on legs; belts with rollers; ladders with rungs."""
+    tool, colour, (a, b) = thing.tool, thing.kind.colour, thing.corners
+    at, half = _frame_of(thing, math.radians(tool.angle)), tool.size / 2
+    if tool.kind == "Ladder":
+        for side in (-1.3, 1.3):
+            pen.line([at(-half, side), at(half, side)], 0.7, colour)
+        for k in range(int(half // 1.25)):
+            pen.line(
+                [at(-half + 1.25 + 2.5 * k, -1.3), at(-half + 1.25 + 2.5 * k, 1.3)], 0.5, colour
+            )
+        return
+    width = max(2 * thing.kind.radius, 1.0)
+    if tool.kind == "Trampoline":
+        below = -1 if math.cos(math.radians(tool.angle)) > -1e-9 else 1  # the side of the ground
+        for end in (-0.75 * half, 0.75 * half):
+            pen.line([at(end), at(end * 1.1, 2.6 * below)], 0.6, "#9aa0ac")
+        pen.line([a, b], width, _shade(colour, 0.75))
+        pen.line([at(-half + 0.4), at(half - 0.4)], 0.8, "#8fb8ff")
+        return
+    pen.line([a, b], width, _shade(colour, 0.72))
+    pen.line([a, b], width * 0.62, colour)
+    if tool.kind == "Conveyor Belt":
+        rollers = max(2, int(half // 1.2))
+        for k in range(rollers + 1):
+            pen.disc(at(half * (2 * k / rollers - 1)), 0.55, "#c9cad6")
+        way = math.copysign(1, tool.speed)
+        for k in range(1 + abs(round(tool.speed)) // 3):  # one to three arrow heads, by speed
+            u = way * (0.8 + 1.6 * k) - 1.2 * way
+            pen.line([at(u - 0.8 * way, 3.0), at(u, 2.2), at(u - 0.8 * way, 1.4)], 0.4, "#4a4e69")
+
+
+def _draw_plank(pen: Pen, thing: Thing) -> None:
+    """Levers and see-saws: foot, plank, bolt, weight; a limited one shows the limit as a foot plate."""
+    x, y, angle = thing.pose()
+    at = _frame_of(thing, angle)
+    ends = [at(*corner) for corner in thing.corners]
+    pen.poly([(x, y), (x - 2.2, y - 3), (x + 2.2, y - 3)], "#8d8a94", "#6a6772", 0.3)
+    if thing.tool.max_angle:
+        pen.line([(x - 2.9, y - 3.1), (x + 2.9, y - 3.1)], 0.7, "#6a6772")
+    pen.line(ends[:2], 1.5, WOOD_EDGE)
+    pen.line(ends[:2], 0.9, WOOD)
+    for end in ends[2:]:
+        radius = 1.2 + 0.07 * thing.tool.mass
+        pen.disc(end, radius, "#4c4a57", "#2f2d38", 0.3)
+    pen.disc((x, y), 0.7, "#55525f")
+
+
+def _draw_polygon(pen: Pen, thing: Thing) -> None:
+    """Solid polygons; bouncy ones carry a bright rubber rim, soft ones a plain face."""
+    colour, corners = thing.kind.colour, thing.corners
+    inner = [(thing.x + 0.55 * (u - thing.x), thing.y + 0.55 * (v - thing.y)) for u, v in corners]
+    pen.poly(corners, colour, _shade(colour, 0.72), 0.45)
+    bouncy = thing.tool.kind.startswith("Bouncy")
+    pen.poly(inner, _shade(colour, 1.35) if bouncy else _shade(colour, 1.2))
+
+
+def _draw_cannon(pen: Pen, thing: Thing) -> None:
+    """A barrel on a wheel, its mouth in the direction of the shot."""
+    colour, at = thing.kind.colour, _frame_of(thing, math.radians(thing.tool.angle))
+    pen.disc(at(-2.2), 3.2, _shade(colour, 0.62))
+    pen.poly([at(-2.2, 3.2), at(-2.2, -3.2), at(4.6, -2.6), at(4.6, 2.6)], _shade(colour, 0.62))
+    pen.disc(at(-2.2), 2.7, colour)
+    pen.poly([at(-2.2, 2.7), at(-2.2, -2.7), at(4.2, -2.1), at(4.2, 2.1)], colour)
+    pen.line([at(-2.0, 1.5), at(3.6, 1.2)], 0.7, _shade(colour, 1.35))
+    pen.poly([at(3.9, 3.5), at(3.9, -3.5), at(5.0, -3.5), at(5.0, 3.5)], _shade(colour, 0.5))
+    pen.disc(at(-2.2), 1.5, "#6b4f3a", "#4a3526", 0.35)
+
+
+def _draw_fan(pen: Pen, thing: Thing) -> None:
+    """A rotor seen from the side at the back, and the wind it makes, longer for a stronger fan."""
+    colour, at = thing.kind.colour, _frame_of(thing, math.radians(thing.tool.angle))
+    pen.poly(thing.corners, (*_shade(colour, 1.85), 150))
+    pen.poly([at(-3.3, 1.1), at(-3.3, -1.1), at(-1.9, -0.8), at(-1.9, 0.8)], _shade(colour, 0.7))
+    for side in (1, -1):
+        blade = [at(-1.9, 0), at(-1.0, 1.6 * side), at(-1.5, 4.6 * side), at(-2.4, 2.6 * side)]
+        pen.poly(blade, colour, _shade(colour, 0.7), 0.3)
+    pen.disc(at(-1.9), 0.9, _shade(colour, 0.6))
+    reach = 0.6 + 2.4 * thing.tool.force / 120
+    for v in (-3.0, 0.0, 3.0):
+        pen.line([at(0.1, v), at(reach, v)], 0.4, "#8fb9d8")
+        pen.line([at(reach - 0.8, v + 0.7), at(reach, v), at(reach - 0.8, v - 0.7)], 0.4, "#8fb9d8")
+
+
+def _draw_funnel(pen: Pen, thing: Thing) -> None:
+    """A cone with a dark mouth and a nozzle."""
+    colour, (left, nozzle, right) = thing.kind.colour, thing.corners
+
+    def mix(a, b, t):
+        return a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])
+
+    pen.poly(thing.corners, colour, _shade(colour, 0.7), 0.5)
+    pen.poly([mix(left, right, 0.18), mix(left, right, 0.42), nozzle], _shade(colour, 1.45))
+    pen.line([left, right], 1.0, _shade(colour, 0.55))
+    pen.disc(nozzle, 0.8, _shade(colour, 0.55))
+
+
+def _draw_bucket(pen: Pen, thing: Thing) -> None:
+    """A pail: two hoops, a bright rim at the opening, a handle over it."""
+    colour, half = thing.kind.colour, thing.tool.size / math.sqrt(2)
+    at = _frame_of(thing, math.radians(thing.tool.angle))
+    bail = [
+        at(half * math.cos(t / 8 * math.pi), half * (1 + 0.55 * math.sin(t / 8 * math.pi)))
+        for t in range(9)
+    ]
+    pen.line(bail, 0.35, "#8b8b94")
+    pen.poly(
+        [at(-half, half), at(-0.8 * half, -half), at(0.8 * half, -half), at(half, half)], colour
+    )
+    pen.poly(thing.corners, (*_shade(colour, 1.0), 90), _shade(colour, 0.65), 0.4)
+    for v in (0.35 * half, -0.55 * half):
+        pen.line([at(-0.93 * half, v), at(0.93 * half, v)], 0.4, _shade(colour, 0.65))
+    pen.line([at(-half, half), at(half, half)], 0.9, _shade(colour, 1.55))
+
+
+def _draw_ball(pen: Pen, thing: Thing) -> None:
+    """Balls that move: a stripe shows the spin, a spot of light the roundness."""
+    (x, y, angle), radius, colour = thing.pose(), float(thing.tool.size), thing.kind.colour
+    pen.disc((x, y), radius, colour, _shade(colour, 0.7), 0.45)
+    c, s = math.cos(angle), math.sin(angle)
+    reach = 0.72 * radius
+    if thing.tool.kind == "Basketball":
+        for u, v in ((c, s), (-s, c)):
+            seam = [(x - reach * u, y - reach * v), (x + reach * u, y + reach * v)]
+            pen.line(seam, 0.35, _shade(colour, 0.55))
+    else:
+        stripe = [(x - reach * c, y - reach * s), (x + reach * c, y + reach * s)]
+        pen.line(stripe, 0.5, (*_shade(colour, 0.75), 150))
+    pen.disc((x - 0.36 * radius, y + 0.38 * radius), 0.24 * radius, (255, 255, 255, 170))
+
+
+def _draw_goal(pen: Pen, thing: Thing) -> None:
+    """The star, the basketball basket and the pale subgoals."""
+    x, y, colour = thing.x, thing.y, thing.kind.colour
+    if thing.tool.kind == "Goal star":
+        points = [(4.3 if k % 2 == 0 else 1.9, math.pi * (0.5 + k / 5)) for k in range(10)]
+        pen.disc((x, y), 5.2, (*_shade(colour, 1.5), 90))
+        corners = [(x + r * math.cos(a), y + r * math.sin(a)) for r, a in points]
+        pen.poly(corners, colour, _shade(colour, 0.7), 0.45)
+        return
+    if thing.tool.kind == "Subgoal":
+        pen.disc((x, y), 3.0, (*_shade(colour, 1.0), 200), "#8fd16a", 0.45)
+        pen.disc((x, y), 1.1, "#a9e08a")
+        return
+    for k in range(-2, 3):  # net
+        pen.line([(x + 2.3 * k, y + 4.2), (x + 1.3 * k - 1.2, y - 4.6)], 0.25, "#9c9ca8")
+        pen.line([(x + 2.3 * k, y + 4.2), (x + 1.3 * k + 1.2, y - 4.6)], 0.25, "#9c9ca8")
+    pen.disc((x, y), 5.0, (*_shade("#5fd32a", 1.5), 60))
+    pen.line([(x - 5, y + 4.4), (x + 5, y + 4.4)], 1.1, colour)
+
+
+def _draw_crate(pen: Pen, thing: Thing) -> None:
+    half = thing.tool.size / 2
+    at = _frame_of(thing, thing.pose()[2])
+    corners = [at(-half, -half), at(half, -half), at(half, half), at(-half, half)]
+    pen.poly(corners, "#c69c6d", "#8a6239", 0.5)
+    pen.line([corners[0], corners[2]], 0.5, "#8a6239")
+
+
+def _draw_disc(pen: Pen, thing: Thing) -> None:
+    colour, place = thing.kind.colour, (thing.x, thing.y)
+    pen.disc(place, thing.tool.size, colour, _shade(colour, 0.72), 0.45)
+    bouncy = thing.tool.kind.startswith("Bouncy")
+    pen.disc(place, 0.5 * thing.tool.size, _shade(colour, 1.35 if bouncy else 1.2))
+
+
+_DRAW = {"segment": _draw_bar, "plank": _draw_plank, "polygon": _draw_polygon, "ball": _draw_ball}
+_DRAW |= {"disc": _draw_disc, "crate": _draw_crate, "Cannon": _draw_cannon, "Fan": _draw_fan}
+_DRAW |= {"Funnel": _draw_funnel, "Bucket": _draw_bucket, "Goal star": _draw_goal}
+_DRAW |= {"Basket": _draw_goal, "Subgoal": _draw_goal}
+
+
+def draw_thing(pen: Pen, thing: Thing) -> None:
+    """Draw one object where it is now."""
+    _DRAW.get(thing.tool.kind, _DRAW.get(thing.kind.family))(pen, thing)
+
+
+def blank_page(size: int) -> Pen:
+    """Paper with a faint grid every eighth of the screen."""
+    pen = Pen(size)
+    for k in range(1, 8):
+        pen.line([(k * WORLD / 8, 0), (k * WORLD / 8, WORLD)], 0.12, GRID)
+        pen.line([(0, k * WORLD / 8), (WORLD, k * WORLD / 8)], 0.12, GRID)
+    return pen
+
+
+def draw_trail(pen: Pen, trail: list, colour: str) -> None:
+    """The way a ball came: dots that fade with age."""
+    recent = trail[-90:]
+    for k, point in enumerate(recent):
+        alpha = int(40 + 150 * k / len(recent))
+        pen.disc(point, 0.55, (*_shade(colour, 1.1), alpha))
+
+
+OUTCOME = {
+    Placement.PLACED: ("placed", "#2a7f3f"),
+    Placement.NO_OP: ("waits", "#6a6772"),
+    Placement.BLOCKED_BY_TOOL: ("too close to a tool", "#c1121f"),
+    Placement.BLOCKED_BY_SHAPE: ("blocked by a shape", "#c1121f"),
+    Placement.OUTSIDE: ("outside the screen", "#c1121f"),
+}
+
+
+def draw_caption(pen: Pen, left: str, right: str, colour: str) -> None:
+    """A line of words along the lower edge."""
+    pen.draw.rectangle((*pen.at((0, 4.6)), *pen.at((WORLD, 0))), fill=(255, 255, 255, 215))
+    pen.text((1.5, 2.3), left, 3.1, INK, "lm")
+    pen.text((WORLD - 1.5, 2.3), right, 3.1, colour, "rm")
+
+
+# ---- demo ----
+
+
+def save_gif(frames: Sequence[np.ndarray], path: Path, fps: int = 15) -> None:
+    """Write RGB frames as a looping GIF that stays on the last frame for a second and a half."""
+    images = [Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE) for frame in frames]
+    durations = [1000 // fps] * (len(images) - 1) + [1500]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
+
+
+def play_episode(task: str, seed: int) -> tuple[list[np.ndarray], float, int]:
+    """A random episode: (colour frames, return, length). Tools are placed on about half the steps."""
+    env = CreateEnv(task=task, render_mode="rgb_array")
+    env.reset(seed=seed)
+    rng, frames, over = np.random.default_rng(seed), [env.render()], False
+    while not over:
+        choice = int(rng.integers(1, NUM_AVAILABLE)) if rng.random() < 0.5 else 0
+        action = {"choice": choice, "position": rng.uniform(-0.9, 0.9, 2)}
+        _, _, terminated, truncated, info = env.step(action)
+        frames += env.render_frames()
+        over = terminated or truncated
+    return frames, info["episode"]["r"], info["episode"]["l"]
+
+
+def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> Image.Image:
+    """Pictures of one size on a sheet, a title under each."""
+    size, bar, gap = tiles[0].shape[0], 26, 10
+    rows = math.ceil(len(tiles) / columns)
+    page = Image.new(
+        "RGB", (columns * (size + gap) + gap, rows * (size + bar + gap) + gap), "white"
+    )
+    draw, font = ImageDraw.Draw(page), ImageFont.load_default(size=17)
+    for k, (tile, title) in enumerate(zip(tiles, titles, strict=True)):
+        x, y = gap + k % columns * (size + gap), gap + k // columns * (size + bar + gap)
+        page.paste(Image.fromarray(tile), (x, y))
+        draw.rectangle((x, y, x + size - 1, y + size - 1), outline="#b8b6c0")
+        draw.text((x + size / 2, y + size + bar / 2 + 1), title, fill=INK, font=font, anchor="mm")
+    return page
+
+
+def all_tasks_sheet(size: int = 300) -> Image.Image:
+    """Figure 7: the 12 tasks as they start."""
+    tiles = []
+    for task in TASKS:
+        env = CreateEnv(task=task, render_mode="rgb_array", render_size=size)
+        env.reset(seed=0)
+        tiles.append(env.render())
+    return sheet(tiles, [f"({'abcdefghijkl'[k]}) {task}" for k, task in enumerate(TASKS)], 4)
+
+
+def tools_sheet(size: int = 190, per_class: int = 3) -> Image.Image:
+    """Some tools of each class, one row per class in three columns, each with the published grey."""
+    labels, tiles, titles = action_labels(), [], []
+    for label in dict.fromkeys(labels[1:_NUM_BASE]):
+        ids = np.flatnonzero(labels[:_NUM_BASE] == label)
+        pen, static_body = blank_page(size), pymunk.Space().static_body
+        spots = [(x, y) for y in (62, 24) for x in (22, 62)]
+        for spot, share in zip(spots, (0.98, 0.15, 0.45, 0.75), strict=True):
+            draw_thing(pen, build(TOOLS[ids[int(share * len(ids))]], *spot, static_body))
+        tiles.append(pen.picture())
+        titles.append(f"{label} ({len(ids)})")
+    return sheet(tiles, titles, 6)
+
+
+def probe_sheet(name: str, size: int = 420, trajectories: int = 40) -> Image.Image:
+    """Probe-ball trajectories over one tool, moved so that the tool stands in the middle."""
+    labels = action_labels()
+    if name.isdigit() and int(name) < NUM_ACTIONS:
+        ids = [int(name)]
+    else:
+        members = np.flatnonzero(np.char.lower(labels[:_NUM_BASE]) == name.lower())
+        if not len(members):
+            raise ValueError(
+                f"unknown tool {name!r}; allowed: 0..{NUM_ACTIONS - 1} or a class: "
+                + ", ".join(dict.fromkeys(labels.tolist()))
+            )
+        ids = [int(members[int(share * len(members))]) for share in (0.1, 0.5, 0.9)]
+    tiles, titles = [], []
+    for action in ids:
+        states = action_observations([action], trajectories, "state", cache=None)[0]
+        pen, static_body = blank_page(size), pymunk.Space().static_body
+        paths = to_units(states[..., 2:4] - states[..., :2]).tolist()
+        for k, path in enumerate(paths):
+            hue = Image.new("HSV", (1, 1), (k * 255 // trajectories, 150, 215)).convert("RGB")
+            colour = "#%02x%02x%02x" % hue.getpixel((0, 0))
+            pen.line(path, 0.3, (*_shade(colour, 1.0), 150))
+            for age, point in enumerate(path):
+                pen.disc(point, 0.35 + 0.11 * age, colour)
+        if TOOLS[action].kind != "No-op":
+            draw_thing(pen, build(TOOLS[action], WORLD / 2, WORLD / 2, static_body))
+        tiles.append(pen.picture())
+        titles.append(f"{labels[action]}, id {action}")
+    return sheet(tiles, titles, len(tiles))
+
+
+@dataclass
+class Args:
+    """CREATE: play an episode and write a GIF, or draw the tasks, the tools or probe trajectories."""
+
+    task: str = "push"  # one of the 12 tasks of Figure 7
+    seed: int = 0  # of the level, the tools on offer and the random actions
+    all_tasks: bool = False  # draw the 12 tasks on one sheet (Figure 7)
+    show_tools: bool = False  # draw tools of every class
+    show_probe: str | None = None  # draw probe-ball trajectories over a tool (class name or id)
+    out: Path = Path("runs/demo")  # folder for the pictures
+
+
+def main(args: Args) -> None:
+    """Draw what was asked for and say where it is."""
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        if args.all_tasks or args.show_tools or args.show_probe is not None:
+            for wanted, name, draw in (
+                (args.all_tasks, "create_tasks.png", all_tasks_sheet),
+                (args.show_tools, "create_tools.png", tools_sheet),
+                (args.show_probe, "create_probe.png", lambda: probe_sheet(args.show_probe)),
+            ):
+                if wanted:
+                    draw().save(args.out / name)
+                    print(f"wrote {args.out / name}")
+            return
+        frames, total, length = play_episode(args.task, args.seed)
+        path = args.out / f"create_{args.task}.gif"
+        save_gif(frames, path)
+    except (ValueError, FileNotFoundError) as e:
+        raise SystemExit(f"error: {e}") from e
+    print(f"random episode of {args.task}: {length} actions, return {total:.2f}; wrote {path}")
+    labels = action_labels()
+    print(f"{NUM_DEFAULT:,} tools in the Default Split, {NUM_ACTIONS:,} over all splits; by class:")
+    for label in dict.fromkeys(labels):
+        ids = np.flatnonzero(labels == label)
+        print(f"  {label:16} {np.sum(ids < NUM_DEFAULT):5,} {len(ids):6,}")
+    for split in SPLITS:
+        sizes = ", ".join(f"{part} {len(ids):,}" for part, ids in split_actions(split).items())
+        print(f"  split {split:9} {sizes}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=Args.__doc__))
