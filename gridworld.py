@@ -21,6 +21,8 @@ Commands:
                                        # skills and recordings in runs/demo, a summary (seconds)
     python gridworld.py --pool train --num-available 10 --seed 3
 
+In Python, `import gridworld` registers gym.make("ActionGen/GridWorld-v0").
+
 Paper map (appendix -> here):
 
     A.1 State                 GridWorldEnv._observation
@@ -29,7 +31,7 @@ Paper map (appendix -> here):
     A.1 Action set split      split_actions
     A.1 Action observations   action_observations
     B, Fig. 4 (quadrants)     action_labels
-    5.4, engineered           engineered_representations
+    B, engineered             engineered_representations
     Table 3 (50 actions, 10)  NUM_AVAILABLE, MAX_SKILLS
 """
 
@@ -322,12 +324,14 @@ class GridWorldEnv(gym.Env):
         return self._observation(), {}
 
     def _draw_episode(self) -> tuple[int, np.ndarray]:
+        # published code: new entropy from the system for every draw; ours: the seeded generator.
         layout = int(self.np_random.integers(len(LAYOUTS)))
         if self.num_available == len(self.action_pool):
             return layout, self.action_pool  # ascending order: a fixed meaning for every position
         return layout, self.np_random.choice(self.action_pool, self.num_available, replace=False)
 
     def _observation(self) -> dict[str, np.ndarray]:
+        # Raw ids, as A.1 says; the published learner normalises them, and so does ours.
         state = self._grid.copy()  # fresh arrays: a learner may keep them
         state[self._position] = AGENT
         return {"state": state.reshape(-1), "available": self._available.copy()}
@@ -451,6 +455,7 @@ class GridWorldVectorEnv(VectorEnv):
         self._return = np.zeros(num_envs)
         self._subgoal_taken = np.zeros(num_envs, np.uint8)
         self._available = np.tile(self.action_pool[:num_available], (num_envs, 1))  # (N, K)
+        self._bank = None  # sets drawn ahead; None until the first reset
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start all episodes anew; returns (observations, {}). A seed reseeds the one generator."""
@@ -471,11 +476,12 @@ class GridWorldVectorEnv(VectorEnv):
     def _draw_available(self, count: int) -> np.ndarray:
         """`count` random sets from the pool: (count, K).
 
-        Drawing each set by itself would cost ten times the rest of the step. A random permutation
-        of the pool, cut into blocks of K, gives many sets for the price of one, each of them
-        exactly a uniform draw without replacement; only blocks of the same permutation depend on
-        each other (they are disjoint). The bank holds one permutation per sub-environment and hands
-        out first all their first blocks, then all their second blocks, to keep such blocks apart.
+        Drawing the sets one by one would take longer than all the rest of a step. A random
+        permutation of the pool, cut into blocks of K, gives many sets for the price of one, each of
+        them exactly a uniform draw without replacement; only blocks of the same permutation depend
+        on each other (they are disjoint). The bank holds one permutation per sub-environment and
+        hands out first all their first blocks, then all their second blocks, ..., so that such
+        blocks are far apart. No block is thrown away: that could favour some skills.
         """
         taken, self._bank = self._bank[:count], self._bank[count:]
         if len(taken) < count:
@@ -495,9 +501,11 @@ class GridWorldVectorEnv(VectorEnv):
 
     def step(self, actions: np.ndarray):
         """One skill in every sub-environment: `actions` int (N,), positions in `available`."""
-        actions = np.asarray(actions)
-        if actions.min() < 0 or actions.max() >= self.num_available:
-            raise ValueError(f"actions are {actions}; allowed: 0..{self.num_available - 1}")
+        if self._bank is None:
+            raise gym.error.ResetNeeded("call reset() before the first step()")
+        actions, k = np.asarray(actions), self.num_available
+        if actions.shape != self._rows.shape or actions.min() < 0 or actions.max() >= k:
+            raise ValueError(f"actions are {actions}; allowed: {self.num_envs} of 0..{k - 1}")
         skills = self._available[self._rows, actions]  # (N,) ids
         self._cell[:], moves, subgoal, goal, lava = self._effects[
             self._layout, self._cell, skills
@@ -601,7 +609,7 @@ def draw_frame(layout: int, path: list, skill: int | None, moves: int) -> np.nda
     if done:
         draw.line([*centres.ravel()], TRAIL, 4 * FINE, "curve")
     for x, y in centres[:-1]:
-        draw.circle((x, y), 5 * FINE, TRAIL)
+        draw.ellipse((x - 5 * FINE, y - 5 * FINE, x + 5 * FINE, y + 5 * FINE), TRAIL)
     forward = MOVE_DELTAS[heading] * CELL * FINE * 0.36
     side = np.array((-forward[1], forward[0])) * 0.85
     tip, base = centres[-1] + forward, centres[-1] - forward * 0.8
@@ -640,7 +648,10 @@ def _text(draw, x: float, y: float, text: str, color: str, size: int, anchor: st
 def episode_frames(
     env: gym.Env, choose: Callable[[dict], int], seed: int | None = None, **reset_options
 ) -> tuple[list[np.ndarray], dict]:
-    """Play one episode of `choose`(observation) -> action; returns (pictures, last info)."""
+    """Play one episode of `choose`(observation) -> action; returns (pictures, last info).
+
+    `seed` and `reset_options` (e.g. layout=3) go to env.reset.
+    """
     observation, info = env.reset(seed=seed, options=reset_options)
     frames, over = env.render_frames(), False
     while not over:
@@ -780,33 +791,37 @@ def _draw_sheet(path: Path, pool: np.ndarray, seed: int) -> None:
 
 
 def main(args: Args) -> None:
-    """What `python gridworld.py` does."""
+    """What `python gridworld.py` does; ValueError for a bad seed or num_available."""
+    if args.seed < 0:
+        raise ValueError(f"seed is {args.seed}; allowed: 0 or more")
     pool = np.arange(NUM_ACTIONS)
     if args.pool != "all":
         pool = split_actions(seed=args.seed)[args.pool]
     env = GridWorldEnv(pool, args.num_available, "rgb_array")
     _print_summary(args, pool)
+    names = ["gridworld_random.gif", "gridworld_sheet.png"]
     for seed in range(args.seed, args.seed + 100):  # with few skills on offer, few can be solved
         observation, _ = env.reset(seed=seed)
         plan = best_plan(env._layout, observation["available"])[1]
         if plan:
             steps = iter(plan)
             frames, info = episode_frames(env, lambda _, steps=steps: next(steps), seed)
-            names = " ".join(skill_name(observation["available"][i]) for i in plan)
-            print(f"solved in {info['moves']} moves: {names}, return {info['episode']['r']:.3f}")
-            save_gif(args.out / "gridworld_solved.gif", frames, env.metadata["render_fps"])
+            skills = " ".join(skill_name(observation["available"][i]) for i in plan)
+            print(f"solved in {info['moves']} moves: {skills}, return {info['episode']['r']:.3f}")
+            names.append("gridworld_solved.gif")
+            save_gif(args.out / names[-1], frames, env.metadata["render_fps"])
             break
     else:
         print("no solution with these skills in 100 episodes")
     env.action_space.seed(args.seed)
     frames, info = episode_frames(env, lambda _: int(env.action_space.sample()), args.seed)
-    save_gif(args.out / "gridworld_random.gif", frames, env.metadata["render_fps"])
-    _draw_sheet(args.out / "gridworld_sheet.png", pool, args.seed)
-    print(f"wrote {', '.join(sorted(str(path) for path in args.out.glob('gridworld_*')))}")
+    save_gif(args.out / names[0], frames, env.metadata["render_fps"])
+    _draw_sheet(args.out / names[1], pool, args.seed)
+    print(f"wrote {', '.join(names)} in {args.out}")
 
 
 if __name__ == "__main__":
     try:
-        main(tyro.cli(Args, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
+        main(tyro.cli(Args))
+    except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None

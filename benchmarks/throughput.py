@@ -39,7 +39,7 @@ def rate(work: Callable[[], int], seconds: float = 2.0) -> float:
 
 @group
 def gridworld() -> Iterator[Row]:
-    """Environment alone: skills per second under a random policy, episodes restarting by themselves."""
+    """The environment alone: skills per second under a random policy, restarts included."""
     import gymnasium as gym
     import numpy as np
 

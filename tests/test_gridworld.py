@@ -567,6 +567,8 @@ def test_step_needs_a_reset():
     env.step(skill_id("RRRRR"))
     with pytest.raises(gym.error.ResetNeeded):
         env.step(0)
+    with pytest.raises(gym.error.ResetNeeded):
+        make_vec(1).step([0])
 
 
 @pytest.mark.parametrize("build", [GridWorldEnv, lambda *args: make_vec(2, *args)])
@@ -602,8 +604,10 @@ def test_other_bad_input():
     for action in (-1, 50):
         with pytest.raises(ValueError, match=r"allowed: 0\.\.49"):
             env.step(action)
-        with pytest.raises(ValueError, match=r"allowed: 0\.\.49"):
+        with pytest.raises(ValueError, match=r"allowed: 2 of 0\.\.49"):
             envs.step([0, action])
+    with pytest.raises(ValueError, match=r"allowed: 2 of 0\.\.49"):
+        envs.step([0])
     with pytest.raises(ValueError, match="'video'.*xy, onehot"):
         gridworld.action_observations([0], 1, "video")
     with pytest.raises(ValueError, match="num_observations is 0"):
