@@ -436,8 +436,9 @@ class Agent(nn.Module):
         super().__init__()
         generator = torch.Generator().manual_seed(args.seed)
         self.method, self.aux_ent_scale, self.workers = args.method, args.aux_ent_scale, workers
-        self.register_buffer("table", torch.as_tensor(table, dtype=torch.float32))  # (A, D)
-        self.register_buffer("train_ids", torch.as_tensor(train_ids))
+        # torch.tensor copies into aligned memory: matrix products may round differently elsewhere.
+        self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
+        self.register_buffer("train_ids", torch.tensor(train_ids))
         H, D = args.hidden_size, table.shape[1]
         W = args.utility_hidden or H
         self.encoder = StateEncoder(state_space, args, generator)
@@ -726,7 +727,7 @@ class Preprocess:
         if self.is_image:
             return torch.as_tensor(state)
         x = self.stats.normalize(state) if self.normalizes else state.astype(np.float32)
-        return torch.from_numpy(x)
+        return torch.from_numpy(x).clone()  # into aligned memory, see Agent
 
     def state(self) -> dict:
         """Plain tensors, for the checkpoint."""

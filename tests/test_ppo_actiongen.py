@@ -1,0 +1,467 @@
+"""The policy script: its pieces against slow obvious versions, then whole short runs."""
+
+import csv
+import json
+import math
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gridworld
+import ppo_actiongen as ppo
+
+ROOT = Path(__file__).parent.parent
+VECTOR = gym.spaces.Box(-10, 10, (7,), np.float32)
+HYBRID = gym.spaces.Dict(
+    choice=gym.spaces.Discrete(5),
+    position=gym.spaces.Box(-1, 1, (2,), np.float32),
+    stop=gym.spaces.Discrete(2),
+)
+
+
+def make_agent(action_space=None, state_space=VECTOR, **changes):
+    """A small agent with a random table of 30 actions, and its arguments."""
+    defaults = dict(utility_gains=(1.0, 1.0, 1.0), norm_obs=False)
+    args = replace(ppo.PRESETS["gridworld"], **(defaults | changes))
+    table = np.random.default_rng(0).standard_normal((30, 4)).astype(np.float32)
+    space = action_space or gym.spaces.Discrete(5)
+    return ppo.Agent(state_space, space, table, np.arange(20), args, ppo.Workers(2)), args
+
+
+def random_sets(rows, K=5, A=30, seed=0):
+    rng = np.random.default_rng(seed)
+    return torch.as_tensor(np.stack([rng.choice(A, K, replace=False) for _ in range(rows)]))
+
+
+# ---- the utility ----
+
+
+def naive_logits(agent, code, available):
+    """D.3.2 word for word: project c, concatenate [state; action], 2-layer MLP, one logit each."""
+    c = agent.action_project(agent.table[available])  # (B, K, H)
+    s = code[:, None].expand(-1, available.shape[1], -1)  # (B, K, H)
+    hidden = F.relu(agent.utility_hidden(torch.cat([s, c], dim=-1)))  # (B, K, W)
+    return agent.utility_out(hidden)[..., 0]  # (B, K)
+
+
+@settings(max_examples=20, deadline=None)
+@given(B=st.integers(1, 40), K=st.integers(1, 12), width=st.sampled_from([16, 64]))
+def test_factorised_utility_equals_the_concatenation(B, K, width):
+    agent, _ = make_agent(utility_hidden=width)
+    code, available = torch.randn(B, 64, generator=torch.Generator().manual_seed(B)), None
+    code.requires_grad_()
+    available = random_sets(B, K)
+    weights = torch.arange(1.0, B * K + 1).view(B, K).sin()
+    grads = []
+    for logits in (
+        naive_logits(agent, code, available),
+        agent.choice_logits(code, available, agent.project_actions()),
+    ):
+        agent.zero_grad()
+        code.grad = None
+        (logits * weights).sum().backward()
+        grads.append([p.grad.clone() for p in agent.parameters() if p.grad is not None])
+        grads[-1] += [code.grad.clone(), logits.detach()]
+    assert len(grads[0]) == len(grads[1]) == 8
+    for a, b in zip(*grads, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_utility_pieces_and_workers_do_not_change_the_result():
+    agent, _ = make_agent()
+    u, P, w = torch.randn(3000, 64), torch.randn(30, 64), torch.randn(64)
+    sets = random_sets(3000)  # more rows than one piece holds
+    for count in (1, 2, 3):
+        logits = ppo.FactorisedUtility.apply(u, P, w, sets, ppo.Workers(count))
+        torch.testing.assert_close(logits, torch.relu(u[:, None] + P[sets]) @ w)
+
+
+def test_policy_is_equivariant_to_the_order_of_the_available_actions():
+    agent, _ = make_agent()
+    code, sets = torch.randn(9, 64), random_sets(9)
+    P = agent.project_actions()
+    order = torch.randperm(5)
+    with torch.no_grad():
+        a = agent.choice_logits(code, sets, P)[:, order]
+        b = agent.choice_logits(code, sets[:, order], P)
+    torch.testing.assert_close(a, b)
+
+
+def test_initial_policy_of_the_paper_is_uniform():
+    agent, _ = make_agent(utility_gains=(0.01, 0.01, 0.01))
+    with torch.no_grad():
+        logits = agent.choice_logits(torch.randn(9, 64), random_sets(9), agent.project_actions())
+    assert logits.abs().max() < 1e-4
+
+
+def test_one_hot_layer_equals_the_product_with_a_one_hot_vector():
+    weight = torch.randn(7 * 6, 10, requires_grad=True)
+    state = torch.randint(0, 6, (50, 7))
+    mix = torch.randn(50, 10)
+    results = []
+    for y in (
+        ppo.OneHotLinear.apply(state + 6 * torch.arange(7), weight),
+        F.one_hot(state, 6).flatten(1).float() @ weight,
+    ):
+        weight.grad = None
+        (y * mix).sum().backward()
+        results.append((y.detach(), weight.grad.clone()))
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+# ---- distributions ----
+
+
+@pytest.mark.parametrize("method", ["utility", "nearest-neighbor", "continuous"])
+def test_log_probability_when_acting_equals_that_when_learning(method):
+    agent, _ = make_agent(HYBRID, method=method)
+    state, sets = torch.randn(11, 7), random_sets(11)
+    P = agent.project_actions()
+    action, logprob, value = agent.act(state, sets, P, torch.Generator().manual_seed(0))
+    code, value2 = agent.encode(state)
+    logprob2, entropy = agent.logprob_entropy(code, sets, action, P)
+    torch.testing.assert_close(logprob, logprob2)
+    torch.testing.assert_close(value, value2)
+    assert set(action) >= {"choice", "position", "stop"} and entropy.shape == (11,)
+    assert action["position"].abs().max() <= 1 and action["choice"].max() < 5
+
+
+def test_hybrid_log_probability_and_entropy_are_sums_of_their_parts():
+    agent, args = make_agent(HYBRID)
+    state, sets = torch.randn(6, 7), random_sets(6)
+    P = agent.project_actions()
+    action, *_ = agent.act(state, sets, P, torch.Generator().manual_seed(1))
+    code, _ = agent.encode(state)
+    logprob, entropy = agent.logprob_entropy(code, sets, action, P)
+    choice = torch.distributions.Categorical(logits=naive_logits(agent, code, sets))
+    alpha, beta = 1 + F.softplus(agent.fc_alpha(code)), 1 + F.softplus(agent.fc_beta(code))
+    position = torch.distributions.Beta(alpha, beta)
+    stop = torch.distributions.Categorical(logits=agent.fc_stop(code))
+    expected = choice.log_prob(action["choice"]) + stop.log_prob(action["stop"])
+    expected = expected + position.log_prob(0.5 + action["position"] / 2).sum(1)
+    torch.testing.assert_close(logprob, expected, rtol=1e-4, atol=1e-4)
+    parts = choice.entropy() + stop.entropy() + 0.1 * position.entropy().sum(1)
+    torch.testing.assert_close(entropy, parts, rtol=1e-4, atol=1e-4)
+
+
+def test_initial_beta_has_the_published_width():
+    agent, _ = make_agent(HYBRID)
+    noise = torch.Generator().manual_seed(0)
+    out, *_ = agent.auxiliary(torch.zeros(20_000, 64), noise)
+    assert abs(out["position"].std().item() - 0.477) < 0.01  # alpha = beta = 1 + log 2
+
+
+def test_sampling_follows_the_probabilities():
+    logp = torch.tensor([0.1, 0.2, 0.7]).log().expand(60_000, 3)
+    counts = torch.bincount(ppo.sample(logp, torch.Generator().manual_seed(0)), minlength=3)
+    assert np.allclose(counts / 60_000, [0.1, 0.2, 0.7], atol=0.01)
+
+
+def test_nearest_neighbour_maps_the_training_action_to_the_nearest_on_offer():
+    agent, _ = make_agent(method="nearest-neighbor")
+    sets = random_sets(50) % 10 + 20  # only actions 20..29: none of the training actions
+    action, *_ = agent.act(torch.randn(50, 7), sets, None, torch.Generator().manual_seed(0))
+    for head, slot, offered in zip(action["head"], action["choice"], sets, strict=True):
+        distances = [float((agent.table[head] - agent.table[j]).square().sum()) for j in offered]
+        assert slot == int(np.argmin(distances))
+
+
+# ---- PPO's arithmetic ----
+
+
+def test_gae_equals_its_recursive_definition():
+    rng = np.random.default_rng(0)
+    r, v, nv = rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), rng.normal(size=3)
+    d = rng.random((9, 3)) < 0.3
+    fast = ppo.gae(r, v, d, nv, 0.9, 0.8)
+
+    def slow(t, n):  # A_t = sum_l (gamma lam)^l delta_{t+l}, cut where the episode ends
+        if t == 9:
+            return 0.0
+        after = v[t + 1, n] if t < 8 else nv[n]
+        delta = r[t, n] + 0.9 * (not d[t, n]) * after - v[t, n]
+        return delta + 0.9 * 0.8 * (not d[t, n]) * slow(t + 1, n)
+
+    for t in range(9):
+        for n in range(3):
+            assert math.isclose(fast[t, n], slow(t, n), abs_tol=1e-12)
+
+
+def test_running_statistics_equal_those_of_all_data_at_once():
+    rng = np.random.default_rng(0)
+    batches = [rng.normal(3, 2, (n, 4)) for n in (1, 5, 100)]
+    stats = ppo.RunningMeanStd((4,))
+    for b in batches:
+        stats.update(b)
+    everything = np.concatenate(batches)
+    assert np.allclose(stats.mean, everything.mean(0), atol=1e-4)
+    assert np.allclose(stats.var, everything.var(0), rtol=1e-3)
+    copy = ppo.RunningMeanStd((4,))
+    copy.load(stats.state())
+    assert np.array_equal(copy.normalize(everything), stats.normalize(everything))
+
+
+def test_reward_scale_divides_by_the_std_of_the_discounted_return():
+    rng = np.random.default_rng(0)
+    rewards, dones = rng.random((20, 4)), rng.random((20, 4)) < 0.2
+    returns, G = [], np.zeros(4)
+    for r, d in zip(rewards, dones, strict=True):
+        G = 0.99 * G + r
+        returns.append(G)
+        G = G * ~d
+    scaled = ppo.RewardScale(4, 0.99)(rewards, dones)
+    assert np.allclose(scaled, rewards / np.std(returns), rtol=1e-3)
+
+
+def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss():
+    agent, args = make_agent(update_epochs=1, num_minibatches=1, max_grad_norm=1e9)
+    B = 32
+    sets, state = random_sets(B), torch.randn(B, 7)
+    action, logprob, value = agent.act(
+        state, sets, agent.project_actions(), torch.Generator().manual_seed(0)
+    )
+    adv, returns = torch.randn(B), torch.randn(B)
+    mb = dict(state=state, available=sets, logprob=logprob, value=value, advantage=adv)
+    loss, parts = ppo.ppo_loss(
+        agent, mb | action | {"return": returns}, agent.project_actions(), args
+    )
+    code, v = agent.encode(state)
+    dist = torch.distributions.Categorical(logits=naive_logits(agent, code, sets))
+    ratio = (dist.log_prob(action["choice"]) - logprob).exp()
+    surrogate = torch.min(ratio * adv, ratio.clamp(0.9, 1.1) * adv).mean()
+    v_clip = value + (v - value).clamp(-0.1, 0.1)
+    v_loss = torch.max((v - returns) ** 2, (v_clip - returns) ** 2).mean() * 0.5
+    expected = -surrogate + 0.5 * v_loss - 0.05 * dist.entropy().mean()
+    torch.testing.assert_close(loss, expected)
+    assert parts["clip_fraction"] == 0  # nothing has changed yet
+
+
+# ---- presets: Tables 3 and 4 ----
+
+
+def test_paper_presets_are_tables_3_and_4():
+    table3 = {  # entropy, K, steps, batch
+        "gridworld": (0.05, 50, 40_000_000, 4096),
+        "recsys": (0.01, 500, 40_000_000, 2048),
+        "create": (0.005, 50, 60_000_000, 3072),
+        "stacking": (0.01, 20, 3_000_000, 1024),
+    }
+    for env, row in table3.items():
+        a = ppo.default_args(env, "paper", False)
+        assert (a.ent_coef, a.num_available, a.total_timesteps, a.minibatch_size) == row
+        table4 = a.learning_rate, a.gamma, a.num_envs, a.hidden_size, a.vf_coef
+        assert table4 == (1e-3, 0.99, 32, 64, 0.5)
+        assert (a.update_epochs, a.clip_coef, a.aux_ent_scale) == (4, 0.1, 0.1)
+
+
+def test_number_of_parameters_of_the_grid_world_policy():
+    space = gym.spaces.Box(0, 11, (81,), np.float32)
+    args = ppo.default_args("gridworld", "paper", False)
+    table = np.zeros((1024, 16), np.float32)
+    agent = ppo.Agent(space, gym.spaces.Discrete(50), table, np.arange(512), args, ppo.Workers(1))
+    assert sum(p.numel() for p in agent.parameters()) == 28_290
+
+
+# ---- whole runs ----
+
+TINY = [
+    *["--representation", "engineered", "--minibatch-size", "64", "--eval-every", "768"],
+    *["--valid-episodes", "32", "--eval-episodes", "64", "--threads", "1", "--no-tensorboard"],
+]
+
+
+def command(folder, *extra, steps=3072):
+    return [
+        *[sys.executable, str(ROOT / "ppo_actiongen.py"), "gridworld", "--runs-dir", str(folder)],
+        *[*TINY, "--total-timesteps", str(steps), *extra],
+    ]
+
+
+def run(*args, **kwargs):
+    return subprocess.run(*args, capture_output=True, text=True, cwd=ROOT, timeout=300, **kwargs)
+
+
+def timeless(folder):
+    rows = list(csv.DictReader((folder / "metrics.csv").open()))
+    return [{k: v for k, v in r.items() if k not in ("seconds", "sps")} for r in rows]
+
+
+def same_weights(a, b):
+    a, b = (ppo.load_checkpoint(f / "checkpoint.pt", "cpu")["agent"] for f in (a, b))
+    return all(torch.equal(a[k], b[k]) for k in a)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """One finished tiny run."""
+    folder = tmp_path_factory.mktemp("runs")
+    result = run(command(folder))
+    assert result.returncode == 0, result.stderr
+    return folder / "gridworld-engineered-s0", result.stdout
+
+
+def test_a_run_leaves_what_it_promises(finished):
+    folder, out = finished
+    names = {p.name for p in folder.iterdir()}
+    files = "args.json metrics.csv checkpoint.pt best.pt results.json curve.png episode.gif"
+    assert set(files.split()) <= names and not any(n.startswith(".") for n in names)
+    rows = list(csv.DictReader((folder / "metrics.csv").open()))
+    assert len(rows) == 12 and rows[-1]["step"] == "3072"
+    assert [bool(r["valid_score"]) for r in rows] == [False, False, True] * 4
+    results = json.loads((folder / "results.json").read_text())
+    assert results["test"]["episodes"] >= 64 and 0 <= results["test"]["score"] <= 1
+    assert results["method"] == "engineered" and results["steps"] == 3072
+    assert results["published"]["test"] == pytest.approx(0.797, abs=1e-3)
+    assert "unseen" in out and "published" in out
+
+
+def test_one_seed_gives_one_run(finished, tmp_path):
+    folder, _ = finished
+    assert run(command(tmp_path)).returncode == 0
+    again = tmp_path / folder.name
+    assert timeless(folder) == timeless(again) and same_weights(folder, again)
+    a, b = (json.loads((f / "results.json").read_text())["test"] for f in (folder, again))
+    assert a == b
+
+
+@pytest.mark.parametrize("moment", [0.3, 0.8])
+def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path, moment):
+    folder, _ = finished
+    killed = tmp_path / folder.name
+    process = subprocess.Popen(command(tmp_path), cwd=ROOT, stdout=subprocess.DEVNULL)
+    deadline = time.time() + 120
+    while time.time() < deadline:  # wait for a share of the updates, then pull the plug
+        metrics = killed / "metrics.csv"
+        if metrics.exists() and len(metrics.read_text().splitlines()) > 1 + moment * 12:
+            break
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    result = run(command(tmp_path, "--resume"))
+    assert result.returncode == 0, result.stderr
+    assert timeless(folder) == timeless(killed) and same_weights(folder, killed)
+
+
+def test_evaluate_a_saved_run(finished):
+    folder, _ = finished
+    script = [sys.executable, str(ROOT / "ppo_actiongen.py"), "evaluate"]
+    args = ["--num-available", "20", "--episodes", "40", "--actions", "valid"]
+    result = run([*script, str(folder), *args])
+    assert result.returncode == 0 and "K=20, 40 episodes" in result.stdout, result.stderr
+    bad = run([*script, str(folder), "--num-available", "257"])
+    assert bad.returncode != 0 and "257" in bad.stderr
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        ["--method", "nearest-neighbor"],
+        ["--method", "continuous"],
+        ["--no-subsample", "--fixed-set-size", "60"],
+        ["--recipe", "paper", "--ent-coef", "0"],
+    ],
+)
+def test_baselines_and_ablations_run(tmp_path, extra):
+    result = run(command(tmp_path, *extra, steps=768))
+    assert result.returncode == 0, result.stderr
+    (folder,) = tmp_path.glob("gridworld-*")
+    assert 0 <= json.loads((folder / "results.json").read_text())["train"]["score"] <= 1
+
+
+@pytest.mark.parametrize(
+    "extra, words",
+    [
+        (["--num-available", "0"], "num_available 0"),
+        (["--num-available", "600"], "600 is more than the 512"),
+        (["--total-timesteps", "-5"], "total_timesteps -5"),
+        (["--total-timesteps", "10"], "less than one rollout of 256"),
+        (["--representation", "nonsense"], "'nonsense'"),
+        (["--representation", "missing.npz"], "missing.npz"),
+        (["--split", "full"], "'full'"),
+        (["--device", "tpu"], "'tpu'"),
+        (["--task", "push"], "'push'"),
+        (["--placement", "1d"], "placement"),
+        (["--minibatch-size", "7"], "multiple of num_envs"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_leaves_nothing(
+    tmp_path, extra, words, monkeypatch, capsys
+):
+    argv = command(tmp_path, *extra)[1:]
+    monkeypatch.setattr(sys, "argv", argv)
+    with pytest.raises(SystemExit) as e:
+        ppo.main()
+    assert words in str(e.value) and str(e.value).startswith("error: ")
+    assert "\n" not in str(e.value)
+    assert not any(tmp_path.rglob("*.*"))
+
+
+def test_unknown_environment_and_recipe(monkeypatch):
+    for argv, word in ((["chess"], "'chess'"), (["gridworld", "--recipe", "slow"], "'slow'")):
+        monkeypatch.setattr(sys, "argv", ["ppo_actiongen.py", *argv])
+        with pytest.raises(SystemExit, match=word):
+            ppo.main()
+
+
+def test_an_existing_run_is_not_overwritten_silently(finished):
+    folder, _ = finished
+    before = (folder / "metrics.csv").read_bytes()
+    result = run(command(folder.parent))
+    assert result.returncode != 0 and "--resume" in result.stderr
+    other = run(command(folder.parent, "--resume", "--ent-coef", "0.3", "--run-name", folder.name))
+    assert other.returncode != 0 and "ent_coef" in other.stderr
+    assert (folder / "metrics.csv").read_bytes() == before
+
+
+def test_broken_checkpoints_are_refused(finished, tmp_path):
+    good = (finished[0] / "checkpoint.pt").read_bytes()
+    for name, content in {
+        "truncated": good[: len(good) // 2],
+        "pickle": pickle.dumps({"agent": 1}),
+        "empty": b"",
+        "foreign": None,
+    }.items():
+        path = tmp_path / name
+        torch.save({"weights": torch.zeros(2)}, path) if content is None else path.write_bytes(
+            content
+        )
+        with pytest.raises(ValueError, match="not a checkpoint"):
+            ppo.load_checkpoint(path, "cpu")
+    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+        ppo.load_checkpoint(tmp_path / "nowhere", "cpu")
+
+
+def test_evaluation_plays_the_same_number_of_episodes_in_every_environment():
+    args = replace(ppo.default_args("gridworld", "fast", True), representation="engineered")
+    args = replace(args, one_hot=False)
+    space = gym.spaces.Box(0, 11, (81,), np.float32)
+    table = gridworld.engineered_representations()
+    agent = ppo.Agent(space, gym.spaces.Discrete(50), table, np.arange(512), args, ppo.Workers(1))
+    preprocess = ppo.Preprocess(gridworld.GridWorldEnv().observation_space["state"], args)
+    pool = gridworld.split_actions()["test"]
+    result = ppo.evaluate(agent, preprocess, args, pool, 1000, seed=0)
+    assert result["episodes"] == 1000
+    # An untrained policy is the uniform one: 0.3 % success, 4.9 skills an episode (exact values).
+    assert result["score"] < 0.02 and abs(result["length"] - 4.92) < 0.35
+
+
+@pytest.mark.slow
+def test_learning_reaches_unseen_skills(tmp_path):
+    extra = ["--minibatch-size", "1024", "--eval-every", "200000", "--eval-episodes", "1000"]
+    assert run(command(tmp_path, *extra, steps=600_000)).returncode == 0
+    results = json.loads((tmp_path / "gridworld-engineered-s0" / "results.json").read_text())
+    assert results["test"]["score"] > 0.15  # a random policy: 0.003
