@@ -1,19 +1,38 @@
 """Recommender System: a simulated user and 10,000 products (appendix A.2 and C.5).
 
-A user alternates between browsing alone (organic session) and being shown recommendations (bandit
-session). The agent sees the user as 16 numbers, picks one of the products on offer, and is paid 1
-for a click. The user drifts all the time, so the same person slowly changes taste.
+The agent recommends one product after another to a user and earns 1 for every click. It sees the
+user as a vector of 16 numbers and every product as another one; it does not see how popular a
+product is. In every episode 500 products are on offer; at test time they are products never used
+in training.
 
-        reset                         +-- 0.05, or any click --+
-          |                           |                        v
-          +--> [organic session] --> [bandit: one recommendation]  -- 0.01 --> user leaves
-                 stays 0.74   ^--------------- 0.94 ------^   (organic also leaves: 0.01 per view)
+      reset                   0.05, and after every click
+        |                    +---------------------------+
+        v                    v                           |
+    a new user --> organic session (looks around) --> bandit session (one recommendation per step)
+                       stays: 0.74         0.25         stays: 0.94
+                         | 0.01                           | 0.01
+                         v                                v
+                        gone                             gone
 
-    python recsys.py                    # plays an episode, writes pictures, prints the ceilings
+Each of these draws also moves the user vector a little. The episode ends when the user is gone, or
+after 100 recommendations.
 
-Paper map:  State A.2 -> RecSysEnv.reset, _draw     Eq. 2 -> click_probability
-            Actions A.2 -> product_vectors, product_bias     Split A.2 -> split_actions
-            Fully observable C.5 -> engineered_representations(fully_observable=True)
+Commands:
+
+    python recsys.py                   # one user's episode as a GIF and a picture, the click curve
+                                       # in runs/demo, a table of floors and ceilings (10 seconds)
+    python recsys.py --policy oracle --pool train --num-available 50 --seed 3
+
+Paper map (appendix -> here):
+
+    A.2 Sessions (Figure 2)     TRANSITIONS, RecSysEnv._draw, RecSysEnv._organic_session
+    A.2 State                   RecSysEnv.reset, RecSysEnv._draw
+    A.2 Actions                 product_vectors, product_bias
+    A.2 Click, Eq. 2            click_probability
+    A.2 Reward                  RecSysEnv.step
+    A.2 Action set split        split_actions
+    C.5 Fully observable        engineered_representations(fully_observable=True)
+    Table 3 (500 actions, 100)  NUM_AVAILABLE, MAX_RECOMMENDATIONS
 """
 
 import functools
@@ -50,7 +69,9 @@ TO_ORGANIC, TO_GONE = TRANSITIONS[BANDIT, ORGANIC], TRANSITIONS[BANDIT, GONE]
 
 
 # ---- the products: what an action is, and how the set is split (A.2) ----
-@functools.lru_cache(maxsize=4)
+
+
+@functools.cache
 def _products(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     c = rng.standard_normal((NUM_ACTIONS, DIM))  # (10_000, 16)
@@ -105,8 +126,8 @@ def engineered_representations(fully_observable: bool = False) -> np.ndarray:
     c = product_vectors()
     if not fully_observable:
         return c.astype(np.float32)
-    # Published code appends mu itself (std 3) to components of std 0.25; we divide by its std, so
-    # that this one input does not drown the other sixteen at the start of learning.
+    # appendix: mu_i is concatenated to c_i; published code: as it is (std 3, beside components of
+    # std 0.25); we divide by its std, so that one input does not drown the other sixteen.
     return np.column_stack([c, product_bias() / MU_STD]).astype(np.float32)
 
 
@@ -116,6 +137,8 @@ def action_labels() -> np.ndarray:
 
 
 # ---- the user (A.2) ----
+
+
 def click_probability(x: np.ndarray) -> np.ndarray:
     """Eq. 2: f(x) for x = c_i . v_user + mu_i, any shape. Between 0.0130 and 0.7311."""
 
@@ -279,6 +302,8 @@ class RecSysEnv(gym.Env):
         # The user clicks with the taste that the agent has seen; v changes only afterwards.
         p_click = click_probability(self.c[product] @ self.user + self.mu[product])
         click = bool(self.np_random.random() < p_click)
+        # appendix: a second click on a product is unlikely, as the user drifts; published code: no
+        # rule against it, and the drift is far too slow; we add no rule either, but offer the flag.
         reward = float(click and not (self.no_repeat_reward and product in self.clicked))
         if click:
             self.clicked.add(product)
@@ -309,10 +334,13 @@ class RecSysEnv(gym.Env):
 
     def _draw(self) -> None:
         """The next mode; every draw perturbs the user, also one that leaves the mode as it is."""
+        # appendix: perturbed after each step; published code: after every draw, page views of an
+        # organic session included; we do the latter.
         self.mode = int(self.np_random.choice(3, p=TRANSITIONS[self.mode]))
         # appendix: covariance sigma_1 sigma_2 I with sigma_2 ~ N(0, 1), negative half of the time;
         # published code: standard deviation 0.1 |sigma_2|; we do the latter, because a covariance
-        # cannot be negative. One sigma_2 for all 16 dimensions.
+        # cannot be negative. One sigma_2 for all 16 dimensions. (The published code also shares one
+        # sequence of sigma_2 among all parallel users, through a fixed seed; we do not.)
         sigma_2 = self.np_random.standard_normal()
         self.user = self.user + SIGMA_1 * abs(sigma_2) * self.np_random.standard_normal(DIM)
 
@@ -595,7 +623,7 @@ POLICY_COLORS = {  # ours: one colour per policy in all pictures
     "oracle": "#2ca02c",
     "mu-only": "#9467bd",
     "c-only": "#1f77b4",
-    "random": "#7f7f7f",
+    "random": "#555555",
 }
 BROWSING = "#f3e3c3"  # ours: organic sessions
 
@@ -732,14 +760,14 @@ def _draw_curve(axes, x: np.ndarray, picks: dict[str, np.ndarray]) -> None:
         p = click_probability(values).mean()
         at = np.interp(p, click_probability(grid), grid)
         axes.plot(at, p, "o", color=POLICY_COLORS[name], markersize=9)
-        below = -16 if name == "mu-only" else 6  # the oracle's label is just above it
+        beside = name in ("mu-only", "random")  # right of the curve: clear of the others
         axes.annotate(
-            f"{name} {p:.2f}", (at, p), (-8, below), textcoords="offset points", ha="right",
-            color=POLICY_COLORS[name], fontsize=11,
+            f"{name} {p:.2f}", (at, p), (8, -14) if beside else (-8, 6), textcoords="offset points",
+            ha="left" if beside else "right", color=POLICY_COLORS[name], fontsize=11,
         )  # fmt: skip
     axes.set(xlim=(-13, 13), ylim=(0, 0.8), xlabel="x = c . v + mu")
     axes.set(ylabel="click probability f(x)")
-    axes.set_title("Eq. 2; average first click of each policy; grey: all products on offer")
+    axes.set_title("Eq. 2; grey: products on offer; dots: average pick for a new user")
 
 
 # ---- the script ----

@@ -5,7 +5,7 @@
 
 Each group is one function that yields rows (what, rate, unit, reference, note). All numbers of a
 group come from one process on one machine, so ratios between its rows can be trusted even when the
-machine is slow or shared; absolute rates are this machine's. Nothing here is a test with a time limit.
+machine is slow or shared; absolute rates are this machine's. Nothing here is a timed test.
 """
 
 import sys
@@ -26,7 +26,7 @@ def group(function: Callable[[], Iterator[Row]]) -> Callable[[], Iterator[Row]]:
 
 
 def rate(work: Callable[[], int], seconds: float = 2.0) -> float:
-    """Call `work` (returns how many units it did) for `seconds`, once before to warm up; units/s."""
+    """Units per second of `work` (returns how many units it did), after one call to warm up."""
     work()
     done, start = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - start) < seconds:
@@ -35,6 +35,44 @@ def rate(work: Callable[[], int], seconds: float = 2.0) -> float:
 
 
 # ---- groups (one function per environment or algorithm) ----
+
+
+@group
+def recsys() -> Iterator[Row]:
+    """Recommender System, environment alone: random actions, drawn before the clock starts."""
+    import numpy as np
+
+    from recsys import RecSysEnv, make_vec, split_actions
+
+    pool, rng = split_actions()["train"], np.random.default_rng(0)
+    source = "published environment, random policy, one process"
+    env = RecSysEnv(pool, 500)
+    env.reset(seed=0)
+    choices = rng.integers(500, size=500).tolist()
+
+    def one_by_one() -> int:
+        for choice in choices:
+            _, _, terminated, truncated, _ = env.step(choice)
+            if terminated or truncated:
+                env.reset()
+        return len(choices)
+
+    scalar = rate(one_by_one)
+    yield "recsys: scalar environment, K = 500", scalar, "steps/s", "4,200", source
+    for num_envs in (32, 1024):
+        envs = make_vec(num_envs, pool, 500, seed=0)
+        envs.reset()
+        actions = rng.integers(500, size=(20, num_envs))
+
+        def batched(envs=envs, actions=actions) -> int:
+            for row in actions:
+                envs.step(row)
+            return actions.size
+
+        fast = rate(batched)
+        what = f"recsys: batched environment, N = {num_envs}, K = 500"
+        yield what, fast, "steps/s", "4,200", source
+        yield "  ratio to the scalar environment", fast / scalar, "x", "", "same process"
 
 
 @group
