@@ -690,7 +690,11 @@ def test_render_shows_the_cells_where_they_are():
             if kind in colors and (x, y) != (1, 1):
                 color = [int(colors[kind][i : i + 2], 16) for i in (1, 3, 5)]
                 assert picture[y * 40 + 20, x * 40 + 20].tolist() == color
-    assert picture[60, 60].tolist() == [0xEE, 0x2B, 0x2B]  # the agent at (1, 1)
+    red = [0xEE, 0x2B, 0x2B]  # the agent at (1, 1), a triangle that points to the right
+    assert picture[60, 70].tolist() == red and picture[70, 60].tolist() != red
+    env.step(skill_id("DDDDD"))  # ends on the lava at (1, 4), pointing down
+    picture = env.render()
+    assert picture[190, 60].tolist() == red and picture[180, 70].tolist() != red
 
 
 def test_render_without_mode_warns():
