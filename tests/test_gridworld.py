@@ -691,10 +691,10 @@ def test_render_shows_the_cells_where_they_are():
                 color = [int(colors[kind][i : i + 2], 16) for i in (1, 3, 5)]
                 assert picture[y * 40 + 20, x * 40 + 20].tolist() == color
     red = [0xEE, 0x2B, 0x2B]  # the agent at (1, 1), a triangle that points to the right
-    assert picture[60, 70].tolist() == red and picture[70, 60].tolist() != red
+    assert picture[60, 66].tolist() == red and picture[70, 60].tolist() != red
     env.step(skill_id("DDDDD"))  # ends on the lava at (1, 4), pointing down
     picture = env.render()
-    assert picture[190, 60].tolist() == red and picture[180, 70].tolist() != red
+    assert picture[186, 60].tolist() == red and picture[180, 70].tolist() != red
 
 
 def test_render_without_mode_warns():
