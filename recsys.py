@@ -507,18 +507,18 @@ class RecSysVectorEnv(VectorEnv):
         self.recommendations += 1
         self.clicks += rewards.astype(np.int64)
         truncated = (self.recommendations >= MAX_RECOMMENDATIONS) & ~gone
-        observation, infos = self._observation(), {}
+        infos = {}
         if (over := gone | truncated).any():
-            infos = self._final_infos(observation, over)
+            infos = self._final_infos(over)
             self._start(over.nonzero()[0])
-            observation = self._observation()
-        return observation, rewards, gone, truncated, infos
+        return self._observation(), rewards, gone, truncated, infos
 
-    def _final_infos(self, observation: dict, over: np.ndarray) -> dict:
+    def _final_infos(self, over: np.ndarray) -> dict:
         """Last observations and infos of the episodes in the mask `over`, as SyncVectorEnv does."""
         final_obs = np.full(self.num_envs, None, object)
         for i in over.nonzero()[0]:
-            final_obs[i] = {key: array[i] for key, array in observation.items()}
+            state = _state(self.users[i], self.unit_norm_state)
+            final_obs[i] = {"state": state, "available": self.available[i].copy()}
 
         def masked(**values: np.ndarray) -> dict:  # key -> values where over, _key -> the mask
             masks = {f"_{key}": over.copy() for key in values}

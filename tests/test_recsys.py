@@ -688,6 +688,48 @@ def test_other_published_cells(policy, options, num_available, expected):
     assert score["ctr"] == pytest.approx(expected, abs=0.015)
 
 
+def first_episodes(choose, **options):
+    """CTR of the first episode of 3,000 users, unseen products, 500 on offer."""
+    n = 3000
+    envs = make_vec(n, TEST, 500, 0, **options)
+    envs.reset()
+    c, mu = envs.c.astype(np.float32)[envs.available], envs.mu[envs.available]  # (n, 500, 16), ...
+    ctr, playing = np.zeros(n), np.ones(n, bool)
+    while playing.any():
+        infos = envs.step(choose(envs, c, mu))[-1]
+        if infos:
+            ended = infos["_final_info"] & playing
+            ctr[ended] = infos["final_info"]["ctr"][ended]
+            playing &= ~ended
+    return ctr.mean()
+
+
+@pytest.mark.slow
+def test_repeating_the_first_best_product_costs_nothing():
+    """A.2 says repeats do not pay; with its own numbers they do."""
+    first = []
+
+    def repeat(envs, c, mu):
+        if not first:
+            first.append(recsys.oracle(envs.users, c, mu, None))
+        return first[0]
+
+    best = recsys.reference_ctr("oracle", TEST, 500, 5000, 0)["ctr"]
+    assert first_episodes(repeat) == pytest.approx(best, abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("weight_of_mu", "expected"), [(0, 0.224), (1, 0.583)])
+def test_no_repeat_reward_published_cells(weight_of_mu, expected):
+    """c-only and oracle, avoiding what was clicked already."""
+
+    def avoid(envs, c, mu):
+        score = np.matmul(c, envs.users.astype(np.float32)[:, :, None])[:, :, 0] + weight_of_mu * mu
+        return np.where(envs._clicked, -np.inf, score).argmax(1)
+
+    assert first_episodes(avoid, no_repeat_reward=True) == pytest.approx(expected, abs=0.015)
+
+
 # ---- pictures, script ----
 
 
