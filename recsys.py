@@ -182,7 +182,7 @@ def _observation_space(num_available: int, unit_norm_state: bool) -> gym.spaces.
 def _state(users: np.ndarray, unit_norm_state: bool) -> np.ndarray:
     """What the agent sees of one or many users: (..., 16) float32, always a fresh array."""
     # appendix: v_user; published code: v_user / norm, then running mean and std; we return v_user
-    # (the spec) and leave scaling to the learner. The oracle scores the same with either.
+    # (the spec) and leave scaling to the learner.
     if unit_norm_state:
         users = (users / np.linalg.norm(users, axis=-1, keepdims=True)).clip(-1, 1)
     return users.astype(np.float32)
@@ -208,7 +208,7 @@ class RecSysEnv(gym.Env):
 
     A.2 argues that a product cannot be recommended twice because the user drifts. With these
     numbers it can: always repeating the first-best product scores as well as the oracle, within
-    0.01. `no_repeat_reward` gives the rule that A.2 describes.
+    0.01. `no_repeat_reward` turns what A.2 describes into a rule.
 
     ## Action Space
     `Discrete(K)`: a position in the `available` array of the last observation.
@@ -744,16 +744,16 @@ def draw_click_curve(path: Path, pool: np.ndarray, num_available: int, seed: int
 
 def _draw_curve(axes, x: np.ndarray, picks: dict[str, np.ndarray]) -> None:
     """f(x), a histogram of x (users, K), and the average click probability of each policy."""
-    grid = np.linspace(-13, 13, 400)
+    grid = np.linspace(-15, 15, 400)
     bars = axes.twinx()
-    bars.hist(x.ravel(), 104, range=(-13, 13), density=True, color="#dcdcdc")
+    bars.hist(x.ravel(), 120, range=(-15, 15), density=True, color="#dcdcdc")
     bars.set(ylim=(0, 0.5), yticks=[])
     axes.set_zorder(bars.get_zorder() + 1)
     axes.patch.set_visible(False)
     limits = click_probability(np.array([-1e3, 1e3]))
     for limit in limits:
         axes.axhline(limit, color="black", linewidth=0.8, linestyle=":")
-        axes.annotate(f"limit {limit:.3f}", (-12.8, limit), (0, 4), textcoords="offset points")
+        axes.annotate(f"limit {limit:.3f}", (-14.8, limit), (0, 4), textcoords="offset points")
     axes.plot(grid, click_probability(grid), color="black", linewidth=2)
     chosen = {name: x[np.arange(len(x)), pick] for name, pick in picks.items()} | {"random": x}
     for name, values in chosen.items():
@@ -762,10 +762,10 @@ def _draw_curve(axes, x: np.ndarray, picks: dict[str, np.ndarray]) -> None:
         axes.plot(at, p, "o", color=POLICY_COLORS[name], markersize=9)
         beside = name in ("mu-only", "random")  # right of the curve: clear of the others
         axes.annotate(
-            f"{name} {p:.2f}", (at, p), (8, -14) if beside else (-8, 6), textcoords="offset points",
+            f"{name} {p:.2f}", (at, p), (3, -17) if beside else (-8, 6), textcoords="offset points",
             ha="left" if beside else "right", color=POLICY_COLORS[name], fontsize=11,
         )  # fmt: skip
-    axes.set(xlim=(-13, 13), ylim=(0, 0.8), xlabel="x = c . v + mu")
+    axes.set(xlim=(-15, 15), ylim=(0, 0.8), xlabel="x = c . v + mu")
     axes.set(ylabel="click probability f(x)")
     axes.set_title("Eq. 2; grey: products on offer; dots: average pick for a new user")
 
