@@ -1,13 +1,13 @@
 """CREATE, the Chain REAction Tool Environment (appendix A.3, B, C.1, C.3 and Table 1).
 
-A two-dimensional physics puzzle. Balls fall; every 40 physics steps the agent picks one of the tools
-on offer and a place to put it, so that the red target ball reaches the green goal. Twelve tasks, 2,111
-tools (and 6,248 more for the Full split and the analyses).
+A two-dimensional physics puzzle. Balls fall; every 40 physics steps the agent picks one of the
+tools on offer and a place to put it, so that the red target ball reaches the green goal. Twelve
+tasks, 2,111 tools (and 6,248 more for the Full split and the analyses).
 
-    python create_env.py --task push            # plays an episode, writes a GIF, counts the tools (5 s)
+    python create_env.py --task push            # the best of 400 random episodes as a GIF (10 s)
     python create_env.py --all-tasks            # Figure 7: the 12 tasks on one sheet
     python create_env.py --show-tools           # one tool of each class
-    python create_env.py --show-probe Cannon    # probe-ball trajectories over one tool (class or id)
+    python create_env.py --show-probe Cannon    # probe-ball trajectories over a tool (class or id)
 
 Paper map
     A.3 actions              _generate_tools(), TOOLS         A.3 state     observation_picture()
@@ -15,8 +15,8 @@ Paper map
     A.3 action observations  action_observations()            B (labels)    action_labels()
     C.1, Figure 7            TASKS                            C.3           subgoal_reward=False
 
-Units: the world is a square of 84 x 84 units, one unit per pixel of the observation, x to the right,
-y up, origin in the lower left corner. "norm" means agent coordinates: unit = (norm + 1) * 42.
+Units: the world is a square of 84 x 84 units, one unit per pixel of the observation, x to the
+right, y up, origin in the lower left corner. "norm" means agent coordinates: unit = (norm + 1) 42.
 Angles are degrees counter-clockwise in the tables and radians in the physics.
 """
 
@@ -32,7 +32,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
@@ -101,7 +101,7 @@ class Contact(enum.IntEnum):
 
 
 class Tool(NamedTuple):
-    """One tool (or one object of a level). Unused parameters are 0, as in the engineered features."""
+    """One tool, or one object of a level. Parameters a class does not use are 0."""
 
     kind: str
     elasticity: float = 0.0
@@ -129,7 +129,8 @@ class Kind(NamedTuple):
 
 ORANGE, BLUE, PLANK_ORANGE = "#fa8535", "#086788", "#fa9149"  # published palette
 KINDS: dict[str, Kind] = {
-    # tools: everything static unless it is a plank. Friction of balls and planks: never set there, 0.
+    # tools: everything static unless it is a plank. Friction of balls and planks: never set there,
+    # 0.
     "No-op": Kind("nothing"),
     "Ramp": Kind("segment", grey=159, colour=ORANGE, radius=1.0),
     "Trampoline": Kind("segment", grey=99, colour="#3d5a98", radius=1.0),
@@ -170,8 +171,9 @@ SENSORS = (Contact.CANNON, Contact.FAN, Contact.BELT, Contact.LADDER, Contact.GO
 
 SOFT, BOUNCY = (0.1, 0.3, 0.5), (0.8, 1.0, 1.2)  # published code: the two elasticity ranges
 SOFT_FINE, BOUNCY_FINE = (0.1, 0.2, 0.3, 0.4, 0.5), (0.8, 0.9, 1.0, 1.1, 1.2)
-# A full turn of a class: the angle after which the shape repeats. Angles run over [0, turn) in steps of
-# 15 degrees, which is the appendix's "no two tools are within 15 degrees difference of each other".
+# A full turn of a class: the angle after which the shape repeats. Angles run over [0, turn) in
+# steps of 15 degrees, which is the appendix's "no two tools are within 15 degrees difference of
+# each other".
 TURN = {"Ramp": 180, "Trampoline": 180, "Cannon": 360, "Fan": 360, "Funnel": 360, "Bucket": 360}
 for _sides, _name in ((3, "Triangle"), (4, "Square"), (5, "Pentagon"), (6, "Hexagon")):
     TURN[_name] = TURN[f"Bouncy {_name}"] = 360 // _sides
@@ -180,7 +182,7 @@ ANALYSIS_KINDS += ("Cannon", "Fan", "Funnel", "Bucket")  # published code
 
 
 def _angled_tools(kind: str, step: int) -> list[Tool]:
-    """All tools of one class that has an angle (or, see-saws, a largest angle), `step` degrees apart."""
+    """All tools of one class that has an angle (see-saws: a largest one), `step` degrees apart."""
     if kind == "Hinged See-saw":
         return [
             Tool(kind, size=size, max_angle=m, friction=f)
@@ -221,8 +223,8 @@ def _generate_tools() -> tuple[list[Tool], int, int]:
     tools = [Tool("No-op")]
     for kind in list(KINDS)[1 : list(KINDS).index("Ball")]:
         tools += _angled_tools(kind, 15)
-    # appendix: lists lever, ball and belt among the 2,111; published code: its 2,111 ids hold none of
-    # them (with them there would be 2,326). We keep 2,111 and give the others the ids after it.
+    # appendix: lists lever, ball and belt among the 2,111; published code: its 2,111 ids hold none
+    # of them (with them there would be 2,326). We keep 2,111 and give the others the ids after it.
     num_default = len(tools)
     tools += [Tool("Ball", e, size=r) for e in SOFT_FINE for r in (3, 5, 7, 9)]
     tools += [Tool("Bouncy Ball", e, size=r) for e in BOUNCY_FINE for r in (3, 5, 7, 9)]
@@ -244,7 +246,7 @@ NO_OP = 0
 
 
 def action_labels() -> np.ndarray:
-    """Class name of every tool, (NUM_ACTIONS,) of str: the names of Table 1, both see-saws as one."""
+    """Class of every tool, (NUM_ACTIONS,) of str: the names of Table 1, both see-saws as one."""
     merged = {"Hinged See-saw": "See-saw"}
     return np.array([merged.get(tool.kind, tool.kind) for tool in TOOLS])
 
@@ -256,8 +258,8 @@ def engineered_representations() -> np.ndarray:
     largest angle (rad), weight, on_left, force, speed, standardised over the 2,326 tools that are
     15 degrees apart (over the 2,111 alone the speed would be constant).
     """
-    # published code: 23 classes (two box classes that no split uses) in an order that changes from run
-    # to run; we sort and leave the boxes out.
+    # published code: 23 classes (two box classes that no split uses) in an order that changes from
+    # run to run; we sort and leave the boxes out.
     classes = sorted({tool.kind for tool in TOOLS})
     one_hot = np.array([[tool.kind == name for name in classes] for tool in TOOLS], np.float64)
     numbers = np.array([tool[1:] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
@@ -269,8 +271,8 @@ def engineered_representations() -> np.ndarray:
 
 # ---- A.3 action set splits, Table 1 ----
 
-# Default Split: one draw of angles per group, so that a bouncy triangle never shares its angle across
-# training and testing with a plain one.
+# Default Split: one draw of angles per group, so that a bouncy triangle never shares its angle
+# across training and testing with a plain one.
 SPLIT_GROUPS = (
     ("Ramp", "Trampoline"),
     ("Triangle", "Bouncy Triangle"),
@@ -285,18 +287,18 @@ SPLITS = ("default", "full", "analysis")
 
 
 def primary_values() -> np.ndarray:
-    """The parameter each tool is split by, degrees, (NUM_ACTIONS,): its angle; see-saws: largest angle."""
+    """What tools are split by, int64 (NUM_ACTIONS,) degrees: angle, or a see-saw's largest angle."""
     return np.array([tool.max_angle or tool.angle for tool in TOOLS], np.int64)
 
 
 def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray]:
     """Train, validation and test ids, each a sorted int64 array (A.3, Table 1).
 
-    | split    | train | valid | test | rule                                                            |
-    |----------|-------|-------|------|-----------------------------------------------------------------|
-    | default  | 1,098 | 507   | 507  | half of the angles of each class train, the others are held out |
-    | full     | 939   | 400   | 400  | by tool class, Table 1                                          |
-    | analysis | 762   | 3,397 | 3,398| multiples of 30 degrees train, the rest of the 3-degree pool not|
+    | split    | train | valid | test  | training tools                                            |
+    |----------|-------|-------|-------|-----------------------------------------------------------|
+    | default  | 1,098 | 507   | 507   | half of the angles of each class                          |
+    | full     | 939   | 400   | 400   | by tool class, Table 1                                    |
+    | analysis | 762   | 3,397 | 3,398 | multiples of 30 degrees, out of the pool at 3 degrees     |
 
     The sets are disjoint except for the no-op (id 0), which is always on offer: as in the published
     arrays it counts once in train and once in the held-out half (here in test).
@@ -339,12 +341,13 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 
 def angle_gaps(action_ids: Sequence[int], train_ids: Sequence[int]) -> np.ndarray:
-    """Degrees from each tool to the nearest training tool of its own class, float64 (len(action_ids),).
+    """Degrees to the nearest training tool of the same class, float64 (len(action_ids),).
 
-    Angles wrap at the class's full turn (a ramp at 177 is 3 degrees from one at 0), see-saw limits do
-    not. A tool whose class has no training tool is infinitely far, the no-op 0 away.
+    Angles wrap at the class's full turn (a ramp at 177 is 3 degrees from one at 0), see-saw limits
+    do not. A tool whose class has no training tool is infinitely far, the no-op 0 away.
     """
-    # published code: compares with every class at once and without wrapping, so that 345 is 345 from 0.
+    # published code: compares with every class at once and without wrapping, so that 345 is 345
+    # from 0.
     kinds, values = np.array([tool.kind for tool in TOOLS]), primary_values()
     ids, train_ids = np.asarray(action_ids, np.int64), np.asarray(train_ids, np.int64)
     gaps = np.full(len(ids), np.inf)
@@ -606,7 +609,7 @@ class Thing:
     """One object in a scene: its table entry, its place (units), its pymunk parts."""
 
     __slots__ = ("tool", "kind", "x", "y", "shape", "body", "parts", "corners", "wants", "touched")
-    __slots__ += ("holder", "first_contact", "shown")
+    __slots__ += ("holder", "first_contact", "shown", "drawn_at", "stamps")
 
     def __init__(self, tool: Tool, x: float, y: float):
         self.tool, self.kind, self.x, self.y = tool, KINDS[tool.kind], float(x), float(y)
@@ -622,6 +625,7 @@ class Thing:
         self.touched = False  # ... and whether it ever came; never cleared
         self.holder: Thing | None = None  # the bucket that holds this ball
         self.first_contact: int | None = None  # probe balls only: physics step of the first contact
+        self.drawn_at, self.stamps = None, []  # cache of the observation's picture
         self.shown: tuple | None = None  # while a past moment is drawn: where it was then
 
     def pose(self) -> tuple[float, float, float]:
@@ -649,11 +653,13 @@ def _rectangle(x: float, y: float, length: float, width: float, degrees: float) 
     return [(x + c * u - s * v, y + s * u + c * v) for u, v in halves]
 
 
-# The rest of the geometry. Where the contact rules and the pictures need a corner by its role, these
-# are the positions in `corners`: funnel 0 and 2 the mouth, 1 the nozzle; bucket 0 and 3 the opening.
+# The rest of the geometry. Where the contact rules and the pictures need a corner by its role,
+# these are the positions in `corners`: funnel 0 and 2 the mouth, 1 the nozzle; bucket 0 and 3 the
+# opening.
 FIRST_CORNER = {"Funnel": 30, "Bucket": 45}  # degrees at tool angle 0 (published code)
-# appendix: a cannon "re-launches in a fixed direction"; published code: a 7.3 x 10 box frozen at 10 rad,
-# whatever the aim (two arguments swapped). We turn a 10 x 7.3 box with the aim; same muzzle, same shot.
+# appendix: a cannon "re-launches in a fixed direction"; published code: a 7.3 x 10 box frozen at 10
+# rad, whatever the aim (two arguments swapped). We turn a 10 x 7.3 box with the aim; same muzzle,
+# same shot.
 BOX_SIZE = {"Cannon": (10.0, 7.3), "Fan": (6.7, 10.0)}  # published code, (along the aim, across)
 MUZZLE = (5.0, 3.65)  # published code: where a cannon puts the ball, times (cos, sin) of the aim
 
@@ -692,7 +698,7 @@ def _build_moving(thing: Thing) -> tuple[pymunk.Body, pymunk.Shape]:
 
 
 def _build_plank(thing: Thing, static_body: pymunk.Body) -> None:
-    """Lever or see-saw: a plank on a pivot, perhaps with an angle limit and a weight on its low end."""
+    """Lever or see-saw: a plank on a pivot, perhaps with a limit and a weight on its low end."""
     tool, x, y = thing.tool, thing.x, thing.y
     limit, weighted = math.radians(tool.max_angle), tool.mass > 0
     # The tilt of a weighted see-saw is part of the segment; its body starts at angle 0.
@@ -735,7 +741,9 @@ def build(tool: Tool, x: float, y: float, static_body: pymunk.Body) -> Thing:
         thing.shape = _build_static(thing, static_body)
         thing.parts = (thing.shape,)
     shape = thing.shape
-    shape.collision_type = int(kind.contact)
+    # most planks have friction 1.0, which slows nothing: they need no rule
+    plain = kind.contact == Contact.PLANK and tool.friction <= 1.0
+    shape.collision_type = int(Contact.PLAIN if plain else kind.contact)
     shape.sensor = kind.contact in SENSORS
     # published code: funnels and buckets 0.5, everything that lists an elasticity its own
     capturing = kind.contact in (Contact.FUNNEL, Contact.BUCKET)
@@ -777,7 +785,7 @@ def _on_ladder(arbiter, space, data) -> None:
 
 
 def _on_cannon(arbiter, space, data) -> None:
-    """Catch the ball and shoot it; only when the contact begins, so the shot is not caught again."""
+    """Catch the ball and shoot it; only when contact begins, so the shot is not caught again."""
     ball, cannon = (shape.thing for shape in arbiter.shapes)
     aim, speed = math.radians(cannon.tool.angle), cannon.tool.force / ball.body.mass
     direction = math.cos(aim), math.sin(aim)
@@ -790,7 +798,8 @@ def _on_fan(arbiter, space, data) -> None:
     ball, fan = arbiter.shapes
     aim, force = math.radians(fan.thing.tool.angle), fan.thing.tool.force
     push = force * math.cos(aim), force * math.sin(aim)
-    # published code: force in the frame of the (rolling) ball; its stand-alone release: in the world
+    # published code: force in the frame of the (rolling) ball; its stand-alone release: in the
+    # world
     ball.body.apply_force_at_world_point(push, ball.body.position)
 
 
@@ -819,16 +828,16 @@ def _on_bucket(arbiter, space, data) -> None:
 
 
 def _on_plank(arbiter, space, data) -> None:
-    """The "friction" of levers and see-saws: rolling on them slows a ball by 2 - friction per step."""
+    """The "friction" of a plank: every step on it slows a ball by the factor 2 - friction."""
     ball, plank = (shape.thing for shape in arbiter.shapes)
     keep = 2.0 - plank.tool.friction
-    if keep < 1.0 and ball.kind.family == "ball":
+    if ball.kind.family == "ball":
         ball.body.velocity = ball.body.velocity * keep
         ball.body.angular_velocity *= keep
 
 
 def make_space() -> pymunk.Space:
-    """An empty world with CREATE's gravity and contact rules; the game and the probe ball share it."""
+    """An empty world with CREATE's gravity and contact rules, for the game and the probe ball."""
     space = pymunk.Space()  # 10 solver iterations and no damping are pymunk's defaults
     space.gravity, space.sleep_time_threshold = GRAVITY, SLEEP_TIME
     space.on_collision(Contact.GOAL, Contact.MOVING, begin=_on_goal)
@@ -897,48 +906,94 @@ def _pixel_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
     return centres, centres[::-1].copy()  # row 0 is the top
 
 
-def _distance(shape: str, numbers, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:
-    """Signed distance (units, negative inside) from the pixels of a window to a stroke, (h, w)."""
+def signed_distance(shape: str, numbers, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:
+    """Units from pixels (columns xs, rows ys) to the edge of a stroke, negative inside, (h, w)."""
     if shape == "disc":
         x, y, radius = numbers
         return np.sqrt((xs - x) ** 2 + (ys - y)[:, None] ** 2) - radius
     if shape == "bar":
         x1, y1, x2, y2, half = numbers
         dx, dy = x2 - x1, y2 - y1
-        along = ((xs - x1) * dx + ((ys - y1) * dy)[:, None]) / (dx * dx + dy * dy)
-        np.clip(along, 0.0, 1.0, out=along)
+        along = ((xs - x1) * dx + ((ys - y1) * dy)[:, None]) / (dx * dx + dy * dy)  # (h, w)
+        np.minimum(np.maximum(along, 0.0, out=along), 1.0, out=along)  # half the time of np.clip
         return np.sqrt((xs - x1 - along * dx) ** 2 + ((ys - y1)[:, None] - along * dy) ** 2) - half
     inside = None
     for (x1, y1), (x2, y2) in zip(numbers, [*numbers[1:], numbers[0]], strict=True):
         dx, dy = x2 - x1, y2 - y1  # corners run counter-clockwise: the outside is on the right
         scale = 1.0 / math.hypot(dx, dy)
-        edge = (xs - x1) * (dy * scale) - ((ys - y1) * (dx * scale))[:, None]
+        edge = (xs - x1) * (dy * scale) - ((ys - y1) * (dx * scale))[:, None]  # (h, w)
         inside = edge if inside is None else np.maximum(inside, edge, out=inside)
     return inside
 
 
-def paint(canvas: np.ndarray, strokes: tuple) -> None:
-    """Draw strokes into a square float32 canvas (size, size) of greys, later ones over earlier."""
-    size = canvas.shape[0]
+def _coverage(shape: str, numbers, xs, ys, scale: float) -> np.ndarray:
+    """Share of each pixel that a stroke covers (edges one pixel soft), (h, w)."""
+    cover = 0.5 - scale * signed_distance(shape, numbers, xs, ys)
+    return np.minimum(np.maximum(cover, 0.0, out=cover), 1.0, out=cover)
+
+
+DISC_PHASES = (
+    8  # ours: discs are kept at eighths of a pixel; computing one takes longer than pasting
+)
+
+
+@lru_cache(maxsize=4096)
+def _disc_coverage(radius: float, phase_x: int, phase_y: int, reach: int) -> np.ndarray:
+    """Coverage of a disc (pixels) whose centre is `phase` eighths past the middle of the window."""
+    middle = np.arange(-reach, reach, dtype=np.float32) + 0.5
+    x, y = phase_x / DISC_PHASES, phase_y / DISC_PHASES
+    return _coverage("disc", (x, y, radius), middle, middle, 1.0)  # (2 reach, 2 reach)
+
+
+def _disc_window(numbers, size: int) -> tuple[np.ndarray, int, int]:
+    """Coverage of a disc and where its window begins (row, column), not yet cut to the picture."""
+    scale = size / WORLD
+    column, row, radius = numbers[0] * scale, size - numbers[1] * scale, numbers[2] * scale
+    left, phase_x = divmod(round(column * DISC_PHASES), DISC_PHASES)
+    top, phase_y = divmod(round(row * DISC_PHASES), DISC_PHASES)
+    reach = int(radius) + 2
+    return _disc_coverage(radius, phase_x, phase_y, reach), top - reach, left - reach
+
+
+def stamps(strokes: tuple, size: int) -> list[tuple]:
+    """Turn strokes into what `paste` needs: rows, columns, grey x coverage, 1 - coverage."""
     scale = size / WORLD  # pixels per unit
     xs, ys = _pixel_grid(size)
+    result = []
     for grey, shape, numbers in strokes:
-        if shape == "poly":
-            px, py, reach = [p[0] for p in numbers], [p[1] for p in numbers], 0.0
-        elif shape == "bar":
-            px, py, reach = numbers[0:4:2], numbers[1:4:2], numbers[4]
+        if shape == "disc":
+            cover, r0, c0 = _disc_window(numbers, size)
+            r1, c1 = r0 + len(cover), c0 + len(cover)
+            if r0 < 0 or c0 < 0 or r1 > size or c1 > size:
+                cover = cover[max(0, -r0) : max(0, size - r0), max(0, -c0) : max(0, size - c0)]
+                r0, c0, r1, c1 = max(0, r0), max(0, c0), min(size, r1), min(size, c1)
         else:
-            px, py, reach = numbers[0:1], numbers[1:2], numbers[2]
-        c0 = max(0, int((min(px) - reach) * scale - 1))
-        c1 = min(size, int((max(px) + reach) * scale + 2))
-        r0 = max(0, int(size - (max(py) + reach) * scale - 1))
-        r1 = min(size, int(size - (min(py) - reach) * scale + 2))
-        if c0 >= c1 or r0 >= r1:
-            continue  # off the screen
-        cover = 0.5 - scale * _distance(shape, numbers, xs[c0:c1], ys[r0:r1])  # (h, w)
-        cover = np.minimum(np.maximum(cover, 0.0, out=cover), 1.0, out=cover)
-        window = canvas[r0:r1, c0:c1]
-        window += cover * (grey - window)
+            bar = shape == "bar"
+            px = numbers[0:4:2] if bar else [corner[0] for corner in numbers]
+            py = numbers[1:4:2] if bar else [corner[1] for corner in numbers]
+            reach = numbers[4] if bar else 0.0
+            c0 = max(0, int((min(px) - reach) * scale - 1))
+            c1 = min(size, int((max(px) + reach) * scale + 2))
+            r0 = max(0, int(size - (max(py) + reach) * scale - 1))
+            r1 = min(size, int(size - (min(py) - reach) * scale + 2))
+            if r0 < r1 and c0 < c1:
+                cover = _coverage(shape, numbers, xs[c0:c1], ys[r0:r1], scale)  # (h, w)
+        if r0 < r1 and c0 < c1:  # else off the screen
+            result.append((slice(r0, r1), slice(c0, c1), grey * cover, 1.0 - cover))
+    return result
+
+
+def paste(canvas: np.ndarray, pieces: list[tuple]) -> None:
+    """Draw stamps into a square float32 canvas (size, size) of greys, later ones over earlier."""
+    for rows, columns, ink, left in pieces:
+        window = canvas[rows, columns]
+        window *= left
+        window += ink
+
+
+def paint(canvas: np.ndarray, strokes: tuple) -> None:
+    """Draw strokes into a square float32 canvas (size, size)."""
+    paste(canvas, stamps(strokes, canvas.shape[0]))
 
 
 # ---- the environment ----
@@ -955,7 +1010,7 @@ class Placement(enum.IntEnum):
 
 
 def check_pool(action_pool: Sequence[int] | None, num_available: int) -> np.ndarray:
-    """The tools an environment may offer, sorted int64, without the no-op; ValueError if unusable."""
+    """The tools an environment may offer, sorted, without the no-op; ValueError if unusable."""
     pool = np.asarray(split_actions()["train"] if action_pool is None else action_pool)
     if pool.ndim != 1 or not np.issubdtype(pool.dtype, np.integer):
         raise ValueError(
@@ -987,13 +1042,15 @@ class CreateEnv(gymnasium.Env):
     where to put the tool's centre (x to the right, y up, in norm). Choice 0 is always the no-op.
 
     ## Observation Space
-    | key       | space                          | meaning                                           |
-    |-----------|--------------------------------|---------------------------------------------------|
-    | state     | Box(0, 255, (3, 84, 84), uint8)| last 3 grey pictures, newest last, 0 before start |
-    | available | Box(0, NUM_ACTIONS-1, (K,), int64) | the tools on offer in this episode            |
+    | key       | space                              | meaning                                    |
+    |-----------|------------------------------------|--------------------------------------------|
+    | state     | Box(0, 255, (3, 84, 84), uint8)    | last 3 grey pictures, newest last; black   |
+    |           |                                    | before the episode began                   |
+    | available | Box(0, NUM_ACTIONS-1, (K,), int64) | the tools on offer in this episode         |
 
-    `available` is the no-op and K - 1 tools drawn without replacement from the pool at every reset. If
-    K is the pool's size there is nothing to draw: the no-op, then the rest of the pool in sorted order.
+    `available` is the no-op and K - 1 tools drawn without replacement from the pool at every reset.
+    If K is the pool's size (no-op included) there is nothing to draw: the no-op, then the rest of
+    the pool in sorted order, so that positions keep their meaning.
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; +1 when the target first moves, in
@@ -1011,8 +1068,8 @@ class CreateEnv(gymnasium.Env):
     ## Arguments
     `action_pool` ids (default: training split), `num_available` K, `task` one of `TASKS`,
     `subgoal_reward=False` pays neither subgoals nor target-hit (C.3), `tool_cost` is taken off the
-    goal and each subgoal per placed tool (0.0; the published curves were made with 0.1), `render_size`
-    pixels of the colour picture. Bad arguments or actions raise ValueError and change nothing.
+    goal and each subgoal per placed tool (0.0; the published curves were made with 0.1),
+    `render_size` pixels of the colour picture. Bad arguments or actions raise ValueError and change nothing.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
@@ -1048,6 +1105,7 @@ class CreateEnv(gymnasium.Env):
             choice=spaces.Discrete(k), position=spaces.Box(-1.0, 1.0, (2,), np.float32)
         )
         self._over = True  # no episode yet
+        self._level_stamps: dict[tuple, list] = {}
 
     # -- reset --
 
@@ -1135,7 +1193,8 @@ class CreateEnv(gymnasium.Env):
             x, y = (float(value) for value in action["position"])
         except (TypeError, ValueError, KeyError, IndexError) as e:
             raise ValueError(
-                f"action must be a dict of an integer 'choice' and two numbers 'position', got {action!r}"
+                "action must be a dict of an integer 'choice' and two numbers 'position', "
+                f"got {action!r}"
             ) from e
         if not 0 <= choice < k:
             raise ValueError(f"choice must be 0..{k - 1}, got {choice}")
@@ -1147,11 +1206,12 @@ class CreateEnv(gymnasium.Env):
         """Put a tool at (x, y) norm if it may stand there."""
         if tool.kind == "No-op":
             return Placement.NO_OP
-        # published code: clips the position first, so its invalid penalty never fires; we test first
+        # published code: clips the position first, so its invalid penalty never fires; we test
+        # first
         if max(abs(x), abs(y)) > 1.0:
             return Placement.OUTSIDE
-        # appendix: "overlap over existing objects"; published code: this distance to earlier tools, or
-        # contact of the exact shapes with anything in the scene. As published.
+        # appendix: "overlap over existing objects"; published code: this distance to earlier tools,
+        # or contact of the exact shapes with anything in the scene. As published.
         if any(math.dist((x, y), centre) <= MIN_TOOL_GAP for centre in self._centres):
             return Placement.BLOCKED_BY_TOOL
         thing = build(tool, to_units(x), to_units(y), self._space.static_body)
@@ -1236,12 +1296,23 @@ class CreateEnv(gymnasium.Env):
         self._canvas = np.full((84, 84), 255.0, np.float32)  # white
         for thing in self._things:
             if thing.body is None:
-                paint(self._canvas, grey_strokes(thing))
+                key = thing.tool, thing.x, thing.y  # level objects without a shift come again
+                if key not in self._level_stamps:
+                    while len(self._level_stamps) >= 256:
+                        del self._level_stamps[next(iter(self._level_stamps))]
+                    self._level_stamps[key] = stamps(grey_strokes(thing), 84)
+                paste(self._canvas, self._level_stamps[key])
 
     def _observe(self) -> dict[str, np.ndarray]:
         canvas = self._canvas.copy()
         for thing in self._moving:
-            paint(canvas, grey_strokes(thing))
+            x, y, angle = thing.pose()
+            # A ball that spins looks the same. What has hardly moved is drawn as the last time.
+            turn = 0 if thing.kind.family == "ball" else round(100 * angle)
+            key = round(DISC_PHASES * x), round(DISC_PHASES * y), turn
+            if key != thing.drawn_at:
+                thing.drawn_at, thing.stamps = key, stamps(grey_strokes(thing), 84)
+            paste(canvas, thing.stamps)
         picture = (canvas + 0.5).astype(np.uint8)[None]  # (1, 84, 84), rounded
         self._frames = np.concatenate([self._frames[1:], picture])  # (3, 84, 84), a fresh array
         return {"state": self._frames.copy(), "available": self._available.copy()}
@@ -1253,11 +1324,11 @@ class CreateEnv(gymnasium.Env):
         return [(thing, thing.pose()) for thing in self._moving]
 
     def render(self) -> np.ndarray | None:
-        """The scene now, in colour: uint8 (render_size, render_size, 3); None without render_mode."""
+        """The scene now, in colour, uint8 (height, render_size, 3); None without render_mode."""
         return self.render_frames()[-1] if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step, every 8 physics steps: 5 of `render()`'s kind, 1 after a reset."""
+        """Pictures of the last step, one every 8 physics steps: 5, or 1 right after a reset."""
         if self.render_mode is None:
             raise ValueError("render_frames needs CreateEnv(render_mode='rgb_array')")
         still = [thing for thing in self._things if thing.body is None]
@@ -1285,7 +1356,7 @@ class CreateEnv(gymnasium.Env):
             for sign in (-1, 1):
                 pen.line([(x - 1.6, y - 1.6 * sign), (x + 1.6, y + 1.6 * sign)], 0.8, colour)
         if self._goal_hit and age == 0:
-            words = "goal!"
+            words, colour = "goal!", "#2a7f3f"
             pen.disc(self._goal.pose()[:2], 7.5, None, "#5fd32a", 0.8)
         name = tool.kind if self._actions else ""
         draw_caption(pen, f"{self._actions}/{self.task.max_actions}  {name}", words, colour)
@@ -1314,8 +1385,8 @@ def make_vec(
     """`num_envs` environments as one (SAME_STEP autoreset); `task_options` go to `CreateEnv`.
 
     `async_envs`: one process per environment (True), all in this process (False), or by the number
-    of cores (None). Both give the same bytes. Environment i starts from seed + i; `reset()` without a
-    seed continues from there, `reset(seed=s)` reseeds with s + i. Raises ValueError as `CreateEnv`.
+    of cores (None). Both give the same bytes. Environment i starts from seed + i; `reset()` without
+    a seed continues from there, `reset(seed=s)` reseeds with s + i. Raises ValueError as `CreateEnv`.
     """
     if num_envs < 1:
         raise ValueError(f"num_envs must be 1 or more, got {num_envs}")
@@ -1352,8 +1423,8 @@ PROBE_SPEED = 12.5  # published code, units/s, times U(0.6, 1.4) (1 + 0.4 attemp
 PROBE_AREA = 0.7  # published code, norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # A.3 and D.3.1 (section B says 84)
 PROBE_BALL = Tool("Marker", 1.0, size=BALL_RADIUS, friction=1.0, mass=BALL_MASS)
-# The no-op has no shape to touch; passing this near to its place counts (published code, norm units;
-# there only looked at after steps 30, 60 and 90, here after every step).
+# The no-op has no shape to touch; passing this near to its place counts (published code, norm
+# units; there only looked at after steps 30, 60 and 90, here after every step).
 NO_OP_REACH = 0.1 * math.sqrt(8)
 CACHE_FROM = 2**14  # ours: requests of fewer trajectories (a second) are not worth a file
 CELL = 1_000.0  # ours, units: trajectories run side by side in one space, too far apart to meet
@@ -1369,14 +1440,15 @@ def action_observations(
 ) -> np.ndarray:
     """Trajectories of a probe ball launched at each tool (A.3 action observations, section B).
 
-    | modality | result                                                                               |
-    |----------|--------------------------------------------------------------------------------------|
-    | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm; the paper's default)                   |
-    | "state"  | float32 (len(ids), n, 7, 6): tool x, y, ball x, y (norm), ball velocity (norm/s)     |
-    | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures drawn from the same trajectories       |
+    | modality | result                                                                           |
+    |----------|----------------------------------------------------------------------------------|
+    | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm; the paper's default)               |
+    | "state"  | float32 (len(ids), n, 7, 6): tool x, y, ball x, y (norm), ball velocity (norm/s) |
+    | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same trajectories           |
 
-    n = `num_observations` (paper: 1,024). Frames are 1/3 s apart; the contact is near the middle. The
-    bytes for one tool depend on (seed, tool, n) only: not on `workers` or on the other ids asked for.
+    n = `num_observations` (paper: 1,024). Frames are 1/3 s apart; the contact is near the middle.
+    The bytes for one tool depend on (seed, tool, n) only, not on `workers` or the other ids.
+    "video" needs 16 MB per tool at n = 1,024: ask for some tools or few trajectories at a time.
     Trajectories of larger requests are kept under `cache` (None: nowhere) and found again.
     Raises ValueError for unknown ids or modality, or numbers below 1.
     """
@@ -1419,7 +1491,7 @@ def _spread(work, jobs: list, workers: int, what: str) -> Iterator:
 
 
 def _cached_states(ids, n: int, seed: int, workers: int, cache) -> np.ndarray:
-    """Stored states of every id, (len(ids), n, 7, 7) float32, computing and keeping what is missing.
+    """States of every id, float32 (len(ids), n, 7, 7); computes and keeps what is missing.
 
     One file per (tool list, constants, n, seed); it grows as more tools are asked for.
     """
@@ -1458,9 +1530,9 @@ def _cached_states(ids, n: int, seed: int, workers: int, cache) -> np.ndarray:
 
 
 def _probe_states(job: tuple[int, int, int]) -> np.ndarray:
-    """All trajectories of one tool, (n, 7, 7) float32: the 6-number states and the plank's angle (rad).
+    """All trajectories of one tool, float32 (n, 7, 7): 6-number states and the plank's angle (rad).
 
-    The rounds below are the attempts: the first launches all n balls, the next only those that missed.
+    The rounds are the attempts: the first launches all n balls, the next those that missed.
     """
     action, n, seed = job
     tool, rng = TOOLS[action], np.random.default_rng([seed, action])
@@ -1493,8 +1565,8 @@ def _probe_states(job: tuple[int, int, int]) -> np.ndarray:
 def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray]:
     """Launch m balls at m copies of a tool, each pair in its own cell of one big space.
 
-    places, start (m, 2) norm; velocity (m, 2) units/s. Returns states (m, 9, 7) float32 and the step
-    of the first contact (m,). One space for all costs a third of one space per trajectory.
+    places, start (m, 2) norm; velocity (m, 2) units/s. Returns states (m, 9, 7) float32 and the
+    step of the first contact (m,): 0 overlap at launch, 91 never.
     """
     m = len(places)
     space = make_space()
@@ -1589,6 +1661,7 @@ def _probe_video(job: tuple[int, np.ndarray]) -> np.ndarray:
 
 # ---- pictures for people (Figures 3 and 7): the same scene, large and in colour ----
 
+CAPTION = 6.0  # ours: units of room under the scene for a line of words
 SMOOTH = 3  # ours: drawn this many times too large, then averaged, which gives soft edges
 PAPER, GRID, INK = "#fdfcf8", "#f1efe8", "#3b3a44"
 WOOD, WOOD_EDGE = "#e0a35c", "#9c6b30"
@@ -1607,7 +1680,8 @@ class Pen:
 
     def __init__(self, size: int, image: Image.Image | None = None):
         self.size, self.scale = size, size * SMOOTH / WORLD
-        self.image = image or Image.new("RGB", (size * SMOOTH, size * SMOOTH), PAPER)
+        height = size + round(size * CAPTION / WORLD)  # pixels
+        self.image = image or Image.new("RGB", (size * SMOOTH, height * SMOOTH), PAPER)
         self.draw = ImageDraw.Draw(self.image, "RGBA")
 
     def at(self, point) -> tuple[float, float]:
@@ -1641,12 +1715,12 @@ class Pen:
         self.draw.text(self.at(point), words, fill=fill, font=font, anchor=anchor)
 
     def picture(self) -> np.ndarray:
-        """The finished picture, uint8 (size, size, 3)."""
+        """The finished picture, uint8 (size and 1/14 of it for the caption, size, 3)."""
         return np.asarray(self.image.reduce(SMOOTH)).copy()
 
 
 def _frame_of(thing: Thing, angle: float):
-    """Function (along, across) -> world point, in a frame at the thing's place turned by `angle`."""
+    """Function (along, across) -> world point, in a frame at the thing's place, turned."""
     x, y = thing.pose()[:2]
     c, s = math.cos(angle), math.sin(angle)
     return lambda u, v=0.0: (x + c * u - s * v, y + s * u + c * v)
@@ -1685,7 +1759,7 @@ def _draw_bar(pen: Pen, thing: Thing) -> None:
 
 
 def _draw_plank(pen: Pen, thing: Thing) -> None:
-    """Levers and see-saws: foot, plank, bolt, weight; a limited one shows the limit as a foot plate."""
+    """Levers and see-saws: foot, plank, bolt, weight; those with a limit stand on a plate."""
     x, y, angle = thing.pose()
     at = _frame_of(thing, angle)
     ends = [at(*corner) for corner in thing.corners]
@@ -1753,18 +1827,17 @@ def _draw_bucket(pen: Pen, thing: Thing) -> None:
     """A pail: two hoops, a bright rim at the opening, a handle over it."""
     colour, half = thing.kind.colour, thing.tool.size / math.sqrt(2)
     at = _frame_of(thing, math.radians(thing.tool.angle))
-    bail = [
-        at(half * math.cos(t / 8 * math.pi), half * (1 + 0.55 * math.sin(t / 8 * math.pi)))
-        for t in range(9)
+    turns = [k / 8 * math.pi for k in range(9)]
+    handle = [at(half * math.cos(t), half * (1 + 0.55 * math.sin(t))) for t in turns]
+    pen.line(handle, 0.35, "#8b8b94")
+    pen.poly(thing.corners, colour, _shade(colour, 0.65), 0.4)
+    shine = [
+        at(u * half, v * half) for u, v in ((-0.7, 0.8), (-0.7, -0.9), (-0.35, -0.9), (-0.35, 0.8))
     ]
-    pen.line(bail, 0.35, "#8b8b94")
-    pen.poly(
-        [at(-half, half), at(-0.8 * half, -half), at(0.8 * half, -half), at(half, half)], colour
-    )
-    pen.poly(thing.corners, (*_shade(colour, 1.0), 90), _shade(colour, 0.65), 0.4)
-    for v in (0.35 * half, -0.55 * half):
-        pen.line([at(-0.93 * half, v), at(0.93 * half, v)], 0.4, _shade(colour, 0.65))
-    pen.line([at(-half, half), at(half, half)], 0.9, _shade(colour, 1.55))
+    pen.poly(shine, _shade(colour, 1.25))
+    for v in (0.3 * half, -0.55 * half):
+        pen.line([at(-half, v), at(half, v)], 0.4, _shade(colour, 0.65))
+    pen.line([at(-half, half), at(half, half)], 1.0, _shade(colour, 1.6))
 
 
 def _draw_ball(pen: Pen, thing: Thing) -> None:
@@ -1856,10 +1929,11 @@ OUTCOME = {
 
 
 def draw_caption(pen: Pen, left: str, right: str, colour: str) -> None:
-    """A line of words along the lower edge."""
-    pen.draw.rectangle((*pen.at((0, 4.6)), *pen.at((WORLD, 0))), fill=(255, 255, 255, 215))
-    pen.text((1.5, 2.3), left, 3.1, INK, "lm")
-    pen.text((WORLD - 1.5, 2.3), right, 3.1, colour, "rm")
+    """A line of words under the scene."""
+    pen.draw.rectangle((*pen.at((0, 0)), *pen.image.size), fill=PAPER)
+    pen.line([(0, -0.1), (WORLD, -0.1)], 0.25, "#cfcdd6")
+    pen.text((1.5, -CAPTION / 2), left, 3.1, INK, "lm")
+    pen.text((WORLD - 1.5, -CAPTION / 2), right, 3.1, colour, "rm")
 
 
 # ---- demo ----
@@ -1872,23 +1946,23 @@ def save_gif(frames: Sequence[np.ndarray], path: Path, fps: int = 15) -> None:
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
 
 
-def play_episode(task: str, seed: int) -> tuple[list[np.ndarray], float, int]:
-    """A random episode: (colour frames, return, length). Tools are placed on about half the steps."""
-    env = CreateEnv(task=task, render_mode="rgb_array")
+def play_episode(task: str, seed: int, render: bool) -> tuple[list[np.ndarray], float, int]:
+    """A random episode: (colour frames, return, length). A tool is tried on half the steps."""
+    env = CreateEnv(task=task, render_mode="rgb_array" if render else None)
     env.reset(seed=seed)
     rng, frames, over = np.random.default_rng(seed), [env.render()], False
     while not over:
         choice = int(rng.integers(1, NUM_AVAILABLE)) if rng.random() < 0.5 else 0
         action = {"choice": choice, "position": rng.uniform(-0.9, 0.9, 2)}
         _, _, terminated, truncated, info = env.step(action)
-        frames += env.render_frames()
+        frames += env.render_frames() if render else []
         over = terminated or truncated
     return frames, info["episode"]["r"], info["episode"]["l"]
 
 
 def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> Image.Image:
     """Pictures of one size on a sheet, a title under each."""
-    size, bar, gap = tiles[0].shape[0], 26, 10
+    size, bar, gap = tiles[0].shape[1], 26, 10
     rows = math.ceil(len(tiles) / columns)
     page = Image.new(
         "RGB", (columns * (size + gap) + gap, rows * (size + bar + gap) + gap), "white"
@@ -1896,7 +1970,7 @@ def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> I
     draw, font = ImageDraw.Draw(page), ImageFont.load_default(size=17)
     for k, (tile, title) in enumerate(zip(tiles, titles, strict=True)):
         x, y = gap + k % columns * (size + gap), gap + k // columns * (size + bar + gap)
-        page.paste(Image.fromarray(tile), (x, y))
+        page.paste(Image.fromarray(tile[:size]), (x, y))  # without its caption
         draw.rectangle((x, y, x + size - 1, y + size - 1), outline="#b8b6c0")
         draw.text((x + size / 2, y + size + bar / 2 + 1), title, fill=INK, font=font, anchor="mm")
     return page
@@ -1912,18 +1986,19 @@ def all_tasks_sheet(size: int = 300) -> Image.Image:
     return sheet(tiles, [f"({'abcdefghijkl'[k]}) {task}" for k, task in enumerate(TASKS)], 4)
 
 
-def tools_sheet(size: int = 190, per_class: int = 3) -> Image.Image:
-    """Some tools of each class, one row per class in three columns, each with the published grey."""
+def tools_sheet(size: int = 300) -> Image.Image:
+    """Four tools of each class, and how many there are 15 degrees apart."""
     labels, tiles, titles = action_labels(), [], []
     for label in dict.fromkeys(labels[1:_NUM_BASE]):
         ids = np.flatnonzero(labels[:_NUM_BASE] == label)
         pen, static_body = blank_page(size), pymunk.Space().static_body
-        spots = [(x, y) for y in (62, 24) for x in (22, 62)]
-        for spot, share in zip(spots, (0.98, 0.15, 0.45, 0.75), strict=True):
+        spots = [(x, y) for y in (58, 26) for x in (26, 58)]
+        for spot, share in zip(spots, (0.98, 0.12, 0.45, 0.7), strict=True):
             draw_thing(pen, build(TOOLS[ids[int(share * len(ids))]], *spot, static_body))
-        tiles.append(pen.picture())
+        edge = size // 8  # cut the margin off
+        tiles.append(pen.picture()[edge : size - edge, edge : size - edge])
         titles.append(f"{label} ({len(ids)})")
-    return sheet(tiles, titles, 6)
+    return sheet(tiles, titles, 5)
 
 
 def probe_sheet(name: str, size: int = 420, trajectories: int = 40) -> Image.Image:
@@ -1946,7 +2021,7 @@ def probe_sheet(name: str, size: int = 420, trajectories: int = 40) -> Image.Ima
         paths = to_units(states[..., 2:4] - states[..., :2]).tolist()
         for k, path in enumerate(paths):
             hue = Image.new("HSV", (1, 1), (k * 255 // trajectories, 150, 215)).convert("RGB")
-            colour = "#%02x%02x%02x" % hue.getpixel((0, 0))
+            colour = "#{:02x}{:02x}{:02x}".format(*hue.getpixel((0, 0)))
             pen.line(path, 0.3, (*_shade(colour, 1.0), 150))
             for age, point in enumerate(path):
                 pen.disc(point, 0.35 + 0.11 * age, colour)
@@ -1959,10 +2034,11 @@ def probe_sheet(name: str, size: int = 420, trajectories: int = 40) -> Image.Ima
 
 @dataclass
 class Args:
-    """CREATE: play an episode and write a GIF, or draw the tasks, the tools or probe trajectories."""
+    """CREATE: play an episode and write a GIF, or draw tasks, tools or probe trajectories."""
 
     task: str = "push"  # one of the 12 tasks of Figure 7
-    seed: int = 0  # of the level, the tools on offer and the random actions
+    seed: int = 0  # of the first episode: level, tools on offer, random actions
+    tries: int = 400  # random episodes played; the one with the best return is drawn
     all_tasks: bool = False  # draw the 12 tasks on one sheet (Figure 7)
     show_tools: bool = False  # draw tools of every class
     show_probe: str | None = None  # draw probe-ball trajectories over a tool (class name or id)
@@ -1983,12 +2059,22 @@ def main(args: Args) -> None:
                     draw().save(args.out / name)
                     print(f"wrote {args.out / name}")
             return
-        frames, total, length = play_episode(args.task, args.seed)
+        if args.tries < 1 or args.seed < 0:
+            raise ValueError(
+                f"tries must be 1 or more and seed 0 or more, got {args.tries}, {args.seed}"
+            )
+        seeds = range(args.seed, args.seed + args.tries)
+        best = max(seeds, key=lambda seed: play_episode(args.task, seed, render=False)[1])
+        frames, total, length = play_episode(args.task, best, render=True)
         path = args.out / f"create_{args.task}.gif"
         save_gif(frames, path)
     except (ValueError, FileNotFoundError) as e:
         raise SystemExit(f"error: {e}") from e
-    print(f"random episode of {args.task}: {length} actions, return {total:.2f}; wrote {path}")
+    print(
+        f"best of {args.tries} random episodes of {args.task}: seed {best}, {length} actions, ",
+        end="",
+    )
+    print(f"return {total:.2f}; wrote {path}")
     labels = action_labels()
     print(f"{NUM_DEFAULT:,} tools in the Default Split, {NUM_ACTIONS:,} over all splits; by class:")
     for label in dict.fromkeys(labels):
