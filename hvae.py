@@ -233,8 +233,10 @@ COUNTS += ("batch_observations", "table_observations", "q_hidden", "hidden")
 # The decoder's smallest sigma is exp(-4 / 2) = 0.135 units: a unit must be so small that what
 # tells actions apart is several sigma. centre and half bring the first state to about [-1, 1].
 UNITS = {
-    "gridworld": dict(centre=39.5, half=39.5, unit=1.0),  # cells 1..78; one move = 7 sigma
-    "create": dict(centre=0.0, half=1.0, unit=4 / 42),  # ours: 4 of 84 pixels, sigma >= 0.5 pixel
+    # cells 1..78; one move = 7 sigma
+    "gridworld": dict(centre=39.5, half=39.5, unit=1.0, y_down=True),
+    # ours: 4 of 84 pixels, so that sigma can fall to half a pixel
+    "create": dict(centre=0.0, half=1.0, unit=4 / 42),
 }
 
 
@@ -249,6 +251,7 @@ class Format:
     centre: float = 0.0
     half: float = 1.0
     unit: float = 1.0
+    y_down: bool = False  # for pictures only
 
     @property
     def visual(self) -> bool:
@@ -1067,13 +1070,15 @@ def plot_reconstructions(model, raw: np.ndarray, titles: list[str], path: Path) 
                 axes.imshow(np.concatenate(list(frames)), cmap="gray", vmin=0, vmax=255)
                 axes.set(xticks=[], yticks=[])
         else:  # all observations on top of each other, moved to a common start
-            ball = slice(-4, -2) if fmt.features == 6 else slice(0, 2)  # CREATE's 6-D: x, y of ball
+            ball = slice(2, 4) if fmt.features == 6 else slice(0, 2)  # CREATE's 6-D: tool, ball, v
             made = np.concatenate([first[:, None], made], 1)  # (n, L, F)
-            for axes, paths in zip(column, (true, made), strict=True):
-                for states in paths:
-                    axes.plot(*(states.astype(float) - states[0])[:, ball].T, "o-", ms=3, alpha=0.5)
-                axes.invert_yaxis()
-                axes.set_aspect("equal", adjustable="datalim")
+            moved = [(paths - first[:, None])[..., ball] for paths in (true, made)]  # (n, L, 2)
+            middle = (moved[0].max((0, 1)) + moved[0].min((0, 1))) / 2
+            reach = 0.6 * np.ptp(moved[0], (0, 1)).max() + 1e-6
+            for axes, paths in zip(column, moved, strict=True):
+                axes.plot(*paths.transpose(2, 1, 0), "o-", ms=3, alpha=0.5)  # x, y: (L, n)
+                axes.set(xlim=middle[0] + reach * np.array([-1, 1]), aspect="equal")
+                axes.set(ylim=middle[1] + reach * np.array([1, -1] if fmt.y_down else [-1, 1]))
                 axes.tick_params(labelsize=6)
         column[0].set_title(title, fontsize=8)
     rows[0, 0].set_ylabel("observed")
