@@ -147,6 +147,8 @@ class Args:
     """The learning rate decays linearly to this fraction, not to zero."""
     lr_decay_steps: int | None = None
     """Steps over which it decays (default: total_timesteps)."""
+    ent_floor: float = 1.0
+    """The entropy coefficient decays linearly to this fraction (ours; the paper: 1)."""
     clip_vloss: bool = True
     """Clip the value loss as PPO's original code does, on the raw value scale."""
     weight_decay: float = 0.0
@@ -608,7 +610,7 @@ class RunningMeanStd:
 
     def state(self) -> dict:
         """Plain tensors, for the checkpoint."""
-        return {k: torch.as_tensor(v) for k, v in vars(self).items()}
+        return {k: torch.as_tensor(v, dtype=torch.float64) for k, v in vars(self).items()}
 
     def load(self, state: dict) -> None:
         """The inverse of `state`."""
@@ -814,7 +816,7 @@ class RewardScale:
         return (rewards / np.sqrt(self.stats.var + 1e-8)).clip(-10, 10)
 
 
-def ppo_loss(agent, mb, P, args: Args):
+def ppo_loss(agent, mb, P, ent_coef: float, args: Args):
     """The clipped loss of one minibatch; returns (loss, dict of its parts)."""
     code, value = agent.encode(mb["state"])
     logprob, entropy = agent.logprob_entropy(code, mb["available"], mb, P)
@@ -827,14 +829,14 @@ def ppo_loss(agent, mb, P, args: Args):
         v_error = torch.max(v_error, (v_near - mb["return"]).square())
     v_loss = 0.5 * v_error.mean()
     entropy = entropy.mean()
-    loss = pg_loss + args.vf_coef * v_loss - args.ent_coef * entropy
+    loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
     with torch.no_grad():
         clip_fraction = ((ratio - 1).abs() > args.clip_coef).float().mean()
     parts = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy, clip_fraction=clip_fraction)
     return loss, {k: v.detach() for k, v in parts.items()}
 
 
-def update(agent, optimizer, batch, args: Args, generator, device):
+def update(agent, optimizer, batch, ent_coef, args: Args, generator, device):
     """PPO's epochs over one rollout; returns the mean of each loss part over all minibatches."""
     skip = ("raw", "reward", "done", "choice" if args.method != "utility" else "")
     b = {k: v.flatten(0, 1).to(device) for k, v in batch.items() if k not in skip}  # (T*N, ...)
@@ -849,7 +851,7 @@ def update(agent, optimizer, batch, args: Args, generator, device):
             mb_inds = permutation[start : start + size]
             mb = {k: v[mb_inds] for k, v in b.items()}
             # The parameters changed, so the whole table is projected again: (A, H), cheap.
-            loss, parts = ppo_loss(agent, mb, agent.project_actions(), args)
+            loss, parts = ppo_loss(agent, mb, agent.project_actions(), ent_coef, args)
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
@@ -873,7 +875,8 @@ def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=
     module = importlib.import_module(MODULES[args.env])
     num_available = num_available or args.eval_available or args.num_available
     num_envs = min(episodes, 40 if episodes >= 1000 else 32)  # published: 40 x 125, 32 x 20
-    quota = -(-episodes // num_envs)
+    quota = np.full(num_envs, episodes // num_envs)
+    quota[: episodes % num_envs] += 1
     device = agent.table.device
     generator = torch.Generator(device).manual_seed(seed)
     envs = make_envs(args, pool, num_envs, min(num_available, len(pool)), seed)
@@ -972,7 +975,7 @@ def load_checkpoint(path: Path, device) -> dict:
         checkpoint = torch.load(path, map_location=device, weights_only=True)
         missing = {"agent", "preprocess", "args"} - set(checkpoint)
     except Exception as e:  # torch raises a dozen kinds for broken or foreign files
-        reason = str(e).strip().splitlines()[0][:100]
+        reason = (str(e).strip() or type(e).__name__).splitlines()[0][:100]
         raise ValueError(f"{path} is not a checkpoint of this script ({reason})") from None
     if missing:
         raise ValueError(f"{path} is not a checkpoint of this script (no {sorted(missing)[0]!r})")
@@ -1272,7 +1275,8 @@ def train(args: Args) -> dict:
         batch["return"] = torch.as_tensor(advantages + values, dtype=torch.float32)
 
         # Learn, then let the normaliser catch up with what was seen.
-        losses = update(run.agent, run.optimizer, batch, args, run.generator, run.device)
+        ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
+        losses = update(run.agent, run.optimizer, batch, ent_coef, args, run.generator, run.device)
         if run.preprocess.normalizes:
             raw = batch["raw"]  # (T, N, ...)
             run.preprocess.stats.update(raw.reshape(-1, *raw.shape[2:]))

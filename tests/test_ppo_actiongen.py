@@ -237,7 +237,7 @@ def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss():
     adv, returns = torch.randn(B), torch.randn(B)
     mb = dict(state=state, available=sets, logprob=logprob, value=value, advantage=adv)
     loss, parts = ppo.ppo_loss(
-        agent, mb | action | {"return": returns}, agent.project_actions(), args
+        agent, mb | action | {"return": returns}, agent.project_actions(), 0.05, args
     )
     code, v = agent.encode(state)
     dist = torch.distributions.Categorical(logits=naive_logits(agent, code, sets))
@@ -356,14 +356,15 @@ def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path, mo
     assert timeless(folder) == timeless(killed) and same_weights(folder, killed)
 
 
-def test_evaluate_a_saved_run(finished):
+def test_evaluate_a_saved_run(finished, monkeypatch, capsys):
     folder, _ = finished
-    script = [sys.executable, str(ROOT / "ppo_actiongen.py"), "evaluate"]
-    args = ["--num-available", "20", "--episodes", "40", "--actions", "valid"]
-    result = run([*script, str(folder), *args])
-    assert result.returncode == 0 and "K=20, 40 episodes" in result.stdout, result.stderr
-    bad = run([*script, str(folder), "--num-available", "257"])
-    assert bad.returncode != 0 and "257" in bad.stderr
+    args = ["--num-available", "20", "--episodes", "41", "--actions", "valid"]
+    monkeypatch.setattr(sys, "argv", ["ppo_actiongen.py", "evaluate", str(folder), *args])
+    ppo.main()
+    assert "K=20, 41 episodes" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [*sys.argv[:3], "--num-available", "257"])
+    with pytest.raises(SystemExit, match="257"):
+        ppo.main()
 
 
 @pytest.mark.parametrize(
@@ -375,11 +376,12 @@ def test_evaluate_a_saved_run(finished):
         ["--recipe", "paper", "--ent-coef", "0"],
     ],
 )
-def test_baselines_and_ablations_run(tmp_path, extra):
-    result = run(command(tmp_path, *extra, steps=768))
-    assert result.returncode == 0, result.stderr
+def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", command(tmp_path, *extra, steps=768)[1:])
+    ppo.main()
     (folder,) = tmp_path.glob("gridworld-*")
     assert 0 <= json.loads((folder / "results.json").read_text())["train"]["score"] <= 1
+    assert "unseen" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -417,13 +419,14 @@ def test_unknown_environment_and_recipe(monkeypatch):
             ppo.main()
 
 
-def test_an_existing_run_is_not_overwritten_silently(finished):
+def test_an_existing_run_is_not_overwritten_silently(finished, monkeypatch):
     folder, _ = finished
     before = (folder / "metrics.csv").read_bytes()
-    result = run(command(folder.parent))
-    assert result.returncode != 0 and "--resume" in result.stderr
-    other = run(command(folder.parent, "--resume", "--ent-coef", "0.3", "--run-name", folder.name))
-    assert other.returncode != 0 and "ent_coef" in other.stderr
+    other = ["--resume", "--ent-coef", "0.3", "--run-name", folder.name]
+    for extra, word in (([], "--resume"), (other, "ent_coef")):
+        monkeypatch.setattr(sys, "argv", command(folder.parent, *extra)[1:])
+        with pytest.raises(SystemExit, match=word):
+            ppo.main()
     assert (folder / "metrics.csv").read_bytes() == before
 
 
