@@ -1388,8 +1388,8 @@ def make_vec(
     of cores (None). Both give the same bytes. Environment i starts from seed + i; `reset()` without
     a seed continues from there, `reset(seed=s)` reseeds with s + i. Raises ValueError as `CreateEnv`.
     """
-    if num_envs < 1:
-        raise ValueError(f"num_envs must be 1 or more, got {num_envs}")
+    if num_envs < 1 or seed < 0:
+        raise ValueError(f"num_envs must be 1 or more and seed 0 or more, got {num_envs}, {seed}")
     CreateEnv(
         action_pool, num_available, **task_options
     )  # bad arguments fail here, not in a worker
@@ -1459,9 +1459,10 @@ def action_observations(
         raise ValueError(f"action_ids must be 0..{NUM_ACTIONS - 1}, got {ids.min()}..{ids.max()}")
     if modality not in MODALITIES:
         raise ValueError(f"unknown modality {modality!r}; allowed: {', '.join(MODALITIES)}")
-    for name, value in (("num_observations", num_observations), ("workers", workers)):
-        if value < 1:
-            raise ValueError(f"{name} must be 1 or more, got {value}")
+    limits = (("num_observations", num_observations, 1), ("workers", workers, 1), ("seed", seed, 0))
+    for name, value, least in limits:
+        if value < least:
+            raise ValueError(f"{name} must be {least} or more, got {value}")
     ids = ids.astype(np.int64)
     states = _cached_states(ids, num_observations, seed, workers, cache)  # (ids, n, 7, 7)
     if modality == "xy":
