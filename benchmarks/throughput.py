@@ -108,6 +108,114 @@ def gridworld() -> Iterator[Row]:
     yield "Grid World, recordings in the 80x80 grid", rate(record), "recordings/s", "-", ""
 
 
+def _learner(env: str, **changes):
+    """A Run of the policy script in a temporary folder (engineered table), its two verbs."""
+    import tempfile
+    from dataclasses import replace
+
+    import torch
+
+    import ppo_actiongen as ppo
+
+    args = replace(ppo.default_args(env, changes.pop("recipe", "paper"), False), **changes)
+    args = replace(
+        args, representation="engineered", runs_dir=tempfile.mkdtemp(), tensorboard=False
+    )
+    run = ppo.Run(args)
+    obs = run.envs.reset(seed=0)[0]
+
+    def rollout():
+        nonlocal obs
+        parts = run.num_steps, run.generator, run.device, run.module.METRIC
+        batch, obs, _ = ppo.rollout(run.envs, obs, run.agent, run.preprocess, *parts)
+        shape = batch["logprob"].shape
+        rewards, dones = batch["reward"].double().numpy(), batch["done"].numpy()
+        adv = ppo.gae(rewards, batch["value"].double().numpy(), dones, 0 * rewards[0], 0.99, 0.95)
+        batch["advantage"] = torch.as_tensor(adv, dtype=torch.float32)
+        batch["return"] = torch.zeros(shape)
+        return batch
+
+    def update(batch):
+        ppo.update(run.agent, run.optimizer, batch, args.ent_coef, args, run.generator, run.device)
+
+    return run, rollout, update
+
+
+@group
+def utility() -> Iterator[Row]:
+    """The utility network on one minibatch, forward and backward, one thread: naive, factorised."""
+    import gymnasium as gym
+    import numpy as np
+    import torch
+    import torch.nn.functional as F
+
+    import ppo_actiongen as ppo
+
+    torch.set_num_threads(1)
+    for name, B, K, D, A in (
+        ("Grid World", 4096, 50, 16, 1024),
+        ("Recommender", 512, 500, 16, 10_000),
+    ):
+        args = ppo.default_args("gridworld", "fast", False)
+        space = gym.spaces.Box(-1, 1, (8,))
+        table = np.random.default_rng(0).standard_normal((A, D)).astype(np.float32)
+        parts = space, gym.spaces.Discrete(K), table, np.arange(A // 2)
+        args.one_hot = False
+        agent = ppo.Agent(*parts, args, ppo.Workers(1))
+        sets = torch.stack([torch.randperm(A)[:K] for _ in range(B)])
+        code = torch.randn(B, 64)
+
+        def naive(agent=agent, sets=sets, code=code) -> int:
+            c = agent.action_project(agent.table[sets])  # (B, K, H)
+            s = code[:, None].expand(-1, sets.shape[1], -1)  # (B, K, H)
+            hidden = F.relu(agent.utility_hidden(torch.cat([s, c], -1)))
+            agent.utility_out(hidden).square().mean().backward()
+            return len(sets)
+
+        def factorised(agent=agent, sets=sets, code=code) -> int:
+            agent.choice_logits(code, sets, agent.project_actions()).square().mean().backward()
+            return len(sets)
+
+        slow, fast = rate(naive), rate(factorised)
+        yield f"{name} utility, naive concatenation, K={K}", slow, "states/s", "-", "appendix D.3.2"
+        yield (
+            f"{name} utility, factorised, K={K}",
+            fast,
+            "states/s",
+            "-",
+            f"{fast / slow:.1f} x naive",
+        )
+
+
+@group
+def learner() -> Iterator[Row]:
+    """Rollout alone, update alone, and both, with the paper's batch settings; evaluation off."""
+    ceiling = "ceiling of the factorised form, one core of another machine"
+    for env, steps, one_core in (("gridworld", 500_000, 15_500), ("recsys", 33_000, 2_000)):
+        for recipe, threads in (("paper", 1), ("paper", 2), ("fast", 1), ("fast", 2)):
+            run, rollout, update = _learner(env, recipe=recipe, threads=threads)
+            batch, label = rollout(), f"{env}, {recipe} recipe, {threads} thread(s)"
+            update(batch)
+            start, acting, done = time.perf_counter(), 0.0, 0
+            while done < steps:
+                before = time.perf_counter()
+                batch = rollout()
+                acting += time.perf_counter() - before
+                update(batch)
+                done += run.batch_size
+            total = time.perf_counter() - start
+            yield f"{label}: rollout alone", done / acting, "steps/s", "-", "acting + environment"
+            yield f"{label}: update alone", done / (total - acting), "steps/s", "-", ""
+            yield (
+                f"{label}: end to end",
+                done / total,
+                "steps/s",
+                f"{one_core * threads:,}",
+                ceiling,
+            )
+            run.envs.close()
+
+
 def main() -> None:
     """Run the groups named on the command line (default: all) and print one table."""
     names = sys.argv[1:] or list(GROUPS)
