@@ -86,7 +86,7 @@ class Args:
     hierarchical: bool = True
     """HVAE; --no-hierarchical: the plain VAE baseline (B)"""
     train_on: Literal["train", "all"] = "train"
-    """actions that the encoder is trained on; all: the oracle encoder (C)"""
+    """actions that the encoder is trained on; all of the split: the oracle encoder (C)"""
     split: str = "default"
     """split of the actions: default, full, ..."""
     split_seed: int = 0
@@ -113,6 +113,8 @@ class Args:
     """Table 4: observations recorded of each action: 1,024"""
     batch_observations: int | None = None
     """observations of each action in one update (paper: all)"""
+    set_size: int | None = None
+    """observations that share the price KL(q(c|X)) of one c; None: those of an update"""
     table_observations: int | None = None
     """observations of each action behind its representation (paper: all)"""
     q_hidden: int | None = None
@@ -167,6 +169,9 @@ RECIPES = {
         # Observations of one skill differ in little but the start, so many small updates teach
         # more than few large ones; a single observation would leave nothing to pool over.
         batch_observations=4,
+        # The paper shows all 1,024 observations in every update: one bears 1/1,024 of the price of
+        # c. With 1/4 instead, most of c falls silent and skills differ in 4 dimensions of 16.
+        set_size=1024,
         # Pooling over 64 of 1,024 observations hardly moves a representation.
         table_observations=64,
         # A free log-variance moves by about lr per update: 10,000 updates from its start to -9.
@@ -181,6 +186,12 @@ RECIPES = {
     ),
 }
 RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=2_000)
+# Balls meet a tool in many ways: more observations say more, and are too different to share a c at
+# a thousandth of its price (c would learn them by heart).
+RECIPES["laptop create"] = dict(
+    batch_observations=16, set_size=None, observations=128, updates=2_000
+)
+RECIPES["quick create"] = dict(batch_observations=8, set_size=None, observations=64, updates=1_000)
 
 
 def load_environment(env: str) -> ModuleType:
@@ -211,7 +222,9 @@ def resolve(args: Args) -> Args:
             )
     preset = TABLE_4 | TABLE_3.get(args.env, TABLE_3["gridworld"])
     preset |= VISUAL if KINDS[modality] in ("image", "video") else {}
-    preset |= RECIPES[args.recipe] | RECIPES.get(f"{args.recipe} {args.env} {modality}", {})
+    preset |= RECIPES[args.recipe]
+    for special in (f"{args.recipe} {args.env}", f"{args.recipe} {modality}"):
+        preset |= RECIPES.get(special, {})
     if args.epochs and not args.updates:
         preset.pop("updates", None)  # asked for in epochs: the recipe's number steps back
     given = {key: value for key, value in asdict(args).items() if value is not None}
@@ -225,7 +238,7 @@ def resolve(args: Args) -> Args:
 
 
 COUNTS = ("representation_size", "batch_size", "epochs", "updates", "observations", "threads")
-COUNTS += ("batch_observations", "table_observations", "q_hidden", "hidden")
+COUNTS += ("batch_observations", "table_observations", "set_size", "q_hidden", "hidden")
 
 
 # ---- observations as the networks see them (appendix B) ----
@@ -583,7 +596,7 @@ class ObservationModel(nn.Module):
 
     def __init__(self, fmt: Format, args: Args, latents: tuple[int, ...]):
         super().__init__()
-        self.format = fmt
+        self.format, self.set_size = fmt, args.set_size or args.batch_observations
         self.encoder = ObservationEncoder(fmt, args)
         features = CONV_FEATURES if fmt.visual else fmt.features
         if fmt.kind == "image":
@@ -606,10 +619,8 @@ class ObservationModel(nn.Module):
         latents, kl_z, kl_c = self.infer(self.encoder(inputs), raw.shape[1], sample)
         output = self.decode(start, *latents)
         rec = self.log_likelihood(target, output).mean()
-        # One c serves the whole set of an action. The paper shows all 1,024 observations in each
-        # update, so one bears 1/1,024 of the price of c; a few of them, drawn at random, estimate
-        # that same objective only if this share stays. (published code: 1/n, with n = 672)
-        kl_z, kl_c = kl_z.mean(), kl_c.mean() / TABLE_4["observations"]
+        # One c serves the whole set, so each of its observations bears a part of the price of c.
+        kl_z, kl_c = kl_z.mean(), kl_c.mean() / self.set_size
         if self.format.kind == "onehot":
             error = (output.detach().argmax(-1) != target).float().mean()
         else:
@@ -704,10 +715,10 @@ class VAE(ObservationModel):
 # ---- training ----
 
 
-def observe(module: ModuleType, ids: np.ndarray, args: Args) -> np.ndarray:
+def observe(module: ModuleType, ids: np.ndarray, n: int, args: Args) -> np.ndarray:
     """Raw observations (len(ids), n, ...). Always seed 0: encoders differ by seed, not by data."""
     workers = args.workers or os.cpu_count() or 1
-    return module.action_observations(ids, args.observations, args.modality, 0, workers)
+    return module.action_observations(ids, n, args.modality, 0, workers)
 
 
 def pick(rng: np.random.Generator, stored: int, actions: int, n: int) -> np.ndarray:
@@ -763,18 +774,23 @@ def fit(model: ObservationModel, data: np.ndarray, args: Args) -> list[dict]:
 
 
 @torch.no_grad()
-def embed(model: ObservationModel, module: ModuleType, args: Args) -> tuple[np.ndarray, np.ndarray]:
-    """Representations of every action, seen or not: mean and log-variance, (NUM_ACTIONS, C)."""
+def embed(
+    model: ObservationModel, module: ModuleType, ids: np.ndarray, args: Args
+) -> tuple[np.ndarray, np.ndarray]:
+    """Representations of the actions `ids`, seen or not: mean and log-variance, (NUM_ACTIONS, C).
+
+    Rows of other actions (CREATE has tools outside of every split) hold the prior, N(0, I).
+    """
     device = next(model.parameters()).device
     model.eval()  # running statistics: a representation does not depend on its neighbours
-    tables = []
-    for ids in np.array_split(np.arange(module.NUM_ACTIONS), -(-module.NUM_ACTIONS // 256)):
-        raw = observe(module, ids, args)[:, : args.table_observations]
-        for part in np.array_split(raw, -(-raw.size // 4_000_000)):  # ours: bounds the memory
-            table = model.represent(torch.from_numpy(np.ascontiguousarray(part)).to(device))
-            tables.append(torch.stack(table).cpu().numpy())  # (2, A, C)
-    mean, log_var = np.concatenate(tables, 1)
-    return mean, log_var
+    tables = np.zeros((2, module.NUM_ACTIONS, args.representation_size), np.float32)
+    chunk = 128 if model.format.visual else len(ids)  # videos of all tools would not fit in memory
+    for some in np.array_split(ids, -(-len(ids) // chunk)):
+        raw = observe(module, some, args.table_observations, args)
+        for part in np.array_split(np.arange(len(some)), -(-raw.size // 4_000_000)):
+            table = model.represent(torch.from_numpy(raw[part]).to(device))
+            tables[:, some[part]] = torch.stack(table).cpu().numpy()
+    return tables[0], tables[1]
 
 
 def train(args: Args) -> Path:
@@ -786,18 +802,19 @@ def train(args: Args) -> Path:
     """
     path, args, module = representation_path(args), resolve(args), load_environment(args.env)
     split = module.split_actions(args.split, args.split_seed)
-    ids = np.arange(module.NUM_ACTIONS) if args.train_on == "all" else split["train"]
+    pool = np.unique(np.concatenate(list(split.values())))
+    ids = pool if args.train_on == "all" else split["train"]
     cuda = args.device == "cuda" or (args.device == "auto" and torch.cuda.is_available())
     threads = torch.get_num_threads()
     torch.set_num_threads(args.threads)
     try:
         with torch.random.fork_rng():  # the caller's random numbers stay as they are
             torch.manual_seed(args.seed)
-            data = observe(module, ids, args)  # training actions only
+            data = observe(module, ids, args.observations, args)  # training actions only
             fmt = Format.of(args.env, args.modality, data.shape, args.relative)
             model = (HVAE if args.hierarchical else VAE)(fmt, args).to("cuda" if cuda else "cpu")
             rows = fit(model, data, args)
-        mean, log_var = embed(model, module, args)
+        mean, log_var = embed(model, module, pool, args)
     finally:
         torch.set_num_threads(threads)
     write_atomically(path.with_suffix(".csv"), lambda file: write_csv(file, rows))
@@ -1010,7 +1027,7 @@ def probe(
 
 def report(model, module, mean: np.ndarray, split: dict, path: Path, args: Args) -> None:
     """Probe scores to the screen and <name>.json, pictures of held-out actions beside it."""
-    held_out = np.sort(np.concatenate([split["valid"], split["test"]]))
+    held_out = np.setdiff1d(np.concatenate([split["valid"], split["test"]]), split["train"])
     scores = probe(mean, split["train"], held_out, args.env)
     name = f"{args.env}-{args.modality}-{'hvae' if args.hierarchical else 'vae'}"
     name += "-all" if args.train_on == "all" else ""
@@ -1025,7 +1042,7 @@ def report(model, module, mean: np.ndarray, split: dict, path: Path, args: Args)
         plot_tsne(mean[held_out], labels[held_out], Path(f"{stem}-tsne.png"), name)
         some = held_out[np.linspace(0, len(held_out) - 1, 8).astype(int)]
         titles = [f"{labels[i]} ({i})" for i in some]
-        raw = observe(module, some, args)[:, :8]
+        raw = observe(module, some, 8, args)
         plot_reconstructions(model, raw, titles, Path(f"{stem}-reconstructions.png"))
 
 

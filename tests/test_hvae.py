@@ -305,7 +305,7 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
     (dict(env="chess"), "unknown environment 'chess'; allowed: gridworld"),
     (dict(env="recsys"), "recsys has no action observations"),
     (dict(modality="smell"), "unknown modality 'smell' for gridworld; allowed: xy, onehot"),
-    (dict(recipe="slow"), "unknown recipe 'slow'"),
+    (dict(recipe="slow"), "unknown recipe 'slow' for gridworld"),
     (dict(train_on="test"), "unknown train_on 'test'"),
     (dict(encoder="cnn"), "unknown encoder 'cnn'"),
     (dict(split="odd"), "odd"),
