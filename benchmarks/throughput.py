@@ -216,6 +216,68 @@ def learner() -> Iterator[Row]:
             run.envs.close()
 
 
+@group
+def create() -> Iterator[Row]:
+    """CREATE: every task with random placements, picture included; batches of 32; the probe ball."""
+    import numpy as np
+
+    import create_env
+
+    published = {"push": 630, "navigate": 650, "obstacle": 450, "seesaw": 510, "belt": 450}
+    published |= {"buckets": 610, "cannon": 460, "collide": 670, "moving": 630, "ladder": 580}
+    published |= {"basket": 540, "funnel": 260}
+    source = "published environment, random policy, one core of another machine"
+    rng = np.random.default_rng(0)
+    choices, positions = rng.integers(50, size=100), rng.uniform(-1, 1, (100, 2))
+    actions = [{"choice": c, "position": p} for c, p in zip(choices, positions, strict=True)]
+    rates, ceilings = [], []
+    for task, reference in published.items():
+        env = create_env.CreateEnv(task=task)
+        env.reset(seed=0)
+
+        def play(env=env) -> int:
+            for action in actions:
+                _, _, terminated, truncated, _ = env.step(action)
+                if terminated or truncated:
+                    env.reset()
+            return len(actions)
+
+        def physics(env=env) -> int:
+            env.reset()
+            for _ in range(7):  # the length of an untouched episode
+                env._simulate()
+            return 7
+
+        rates.append(rate(play))
+        ceilings.append(rate(physics, 1.0))
+        yield f"create: {task}", rates[-1], "steps/s", f"{reference:,}", source
+    mean, ceiling = float(np.mean(rates)), float(np.mean(ceilings))
+    yield "create: mean of the 12 tasks", mean, "steps/s", "4,000", "aim; published about 450"
+    yield "  40 bare physics steps (ceiling), mean", ceiling, "steps/s", "", "same process"
+    yield "  ratio to that ceiling", mean / ceiling, "x", "", "same process"
+    for parallel in (False, True):
+        envs = create_env.make_vec(32, None, 50, seed=0, async_envs=parallel)
+        envs.reset()
+        batch = {"choice": rng.integers(50, size=32), "position": rng.uniform(-1, 1, (32, 2))}
+        batch["position"] = batch["position"].astype(np.float32)
+
+        def together(envs=envs, batch=batch) -> int:
+            for _ in range(5):
+                envs.step(batch)
+            return 5 * envs.num_envs
+
+        name = "one process each" if parallel else "one process"
+        yield f"create: push, N = 32, {name}", rate(together, 5.0), "steps/s", "", ""
+        envs.close()
+    ids, start = np.arange(0, create_env.NUM_DEFAULT, 53), time.perf_counter()
+    create_env.action_observations(ids, 1024, cache=None)
+    per_tool = (time.perf_counter() - start) / len(ids)
+    note = f"from every 53rd tool ({len(ids)} tools) in one process"
+    yield "create: probe ball, 1,024 trajectories", 1 / per_tool, "tools/s", "2.3", note
+    minutes = per_tool * create_env.NUM_DEFAULT / 60 / 2
+    yield "  all 2,111 tools on 2 cores, extrapolated", minutes, "minutes", "8", "aim"
+
+
 def main() -> None:
     """Run the groups named on the command line (default: all) and print one table."""
     names = sys.argv[1:] or list(GROUPS)
