@@ -1,22 +1,33 @@
 """Shape Stacking: build the tallest tower from shapes never seen before (appendix A.4).
 
-An empty table, two cylinders, a handful of the 810 shapes on offer. Each action names a shape and the
-place above which it is let go; the physics (pybullet) decides what stays up. The score is the height
-of the highest shape when the agent stops or has acted ten times.
+Two cylinders stand on a table; 20 of 810 shapes are on offer. An action names a shape and the place
+above which it is let go, and the physics (pybullet) decides what stays up. The score is the height
+of the highest shape when the agent stops or has acted ten times. At test time the shapes on offer
+are of sizes (or classes) never used in training, so the agent must understand pictures of them.
 
-                  .--.
-                  |__|        <- dropped 0.02 above everything, at the x the agent chose
-             ____________
-            |____________|
-              .-.   .-.
-    __________|_|___|_|__________   table: z = 0, the camera looks along +y
+                       __
+                      |__|     <- let go 0.02 above everything, at the x the agent chose
+              ____________
+             |____________|    z up, x to the right; the camera looks along y
+                .-.   .-.
+    ____________|_|___|_|____________  table, z = 0
 
-    $ python stacking_env.py                    # a tower by a simple plan -> runs/demo/stacking.gif
-    $ python stacking_env.py --show-shapes      # also a sheet of all shape families and views
+Commands:
 
-Paper map, top to bottom:  the 810 shapes A.4 -> SHAPES    action set split A.4, Table 2 ->
-split_actions()    action observations A.4, B -> action_observations()    state A.4 -> _observe()
-actions A.4, C.6 -> step(), `placement`    reward Eq. 4 -> eq4_reward()
+    python stacking_env.py                  # a planned and a random tower as GIFs in runs/demo, a
+                                            # summary (about 15 seconds)
+    python stacking_env.py --show-shapes    # also a sheet of all shape families and their views
+
+Paper map (appendix -> here):
+
+    A.4 Actions, the 810 shapes   FAMILIES, SHAPES; StackingEnv.step
+    A.4 Action set split, Table 2 split_actions
+    A.4 State                     StackingEnv._observe
+    A.4 Action observations, B    action_observations
+    A.4 Reward, Eq. 4             eq4_reward
+    B, Fig. 6 (classes)           action_labels
+    C.6, Fig. 13                  PLACEMENTS (No Place, 1D Place, 2D Place), split "full"
+    Table 3 (20 actions, 10)      NUM_AVAILABLE, MAX_STEPS
 """
 
 import hashlib
@@ -25,7 +36,7 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -52,9 +63,7 @@ NUM_AVAILABLE = 20  # Table 3 "actions per episode"
 LAMBDA_TOP = LAMBDA_AVG = 0.5  # Eq. 4
 FRAMES = 4  # A.4 "stack past 4 frames"
 SIZE = 84  # A.4 "84x84 grayscale image"
-DROP_GAP = (
-    0.02  # ours: A.4 says "soft drop" over the topmost shape; a real gap of 2 cm on 10-100 cm
-)
+DROP_GAP = 0.02  # ours: a soft drop (A.4) from a visible gap of 2 cm; shapes are 16 to 192 wide
 CYLINDERS = (798, 799, 800)  # published code: the start cylinders are two copies of one of these
 CENTRE, AXIS_GAP = (-0.2, 0.2), (1.0, 1.6)  # published code: "random locations on a line" (A.4)
 
@@ -68,7 +77,7 @@ SOLVER_ITERATIONS = 50  # ours: with 20 tall towers creep and fall
 MASS = 1.0
 # published code: sliding, spinning, rolling friction 2, 2, .25, close to glue; ours: 1, .1, .05, so
 # that spheres come to rest but the class of a shape still decides what can stand on it. Bullet
-# multiplies the sliding coefficients of a pair and mixes the other two as r1 f2 + r2 f1, hence the 2.
+# multiplies the sliding coefficients of a pair and mixes the others as r1 f2 + r2 f1, hence the 2.
 FRICTION = {"lateralFriction": 1.0, "spinningFriction": 0.1 / 2, "rollingFriction": 0.05 / 2}
 # appendix: always 300 steps; ours: stop once all is at rest. Looking every 5th step, at rest = two
 # looks in a row with every (angular) velocity component below .05. It is part of the task's
@@ -77,14 +86,12 @@ CHECK_EVERY, FIRST_CHECK, LOOKS, REST_SPEED = 5, 10, 2, 0.05
 
 # ---- pictures ----
 FOV = 45.0  # published code, degrees
-FRONT_EYE, FRONT_TARGET = (0.0, -7.0, 2.5), (0.0, 0.0, 2.5)  # published code, mirrored: right = +x
-RAISED_EYE, RAISED_TARGET = (0.0, -4.0, 5.5), (0.0, 1.66, 0.0)  # the same for 2D Place
+FRONT = (0.0, -7.0, 2.5), (0.0, 0.0, 2.5)  # published code: eye and target; right = +x, floor z = 0
+RAISED = (0.0, -4.0, 5.5), (0.0, 1.66, 0.0)  # the same for 2D Place
 VIEW_RADIUS, VIEW_HEIGHT = 2.0, (0.5, 2.0)  # published code: a circle around the shape, and heights
-SUN = np.array([0.25, -1.0, 0.6]) / np.linalg.norm(
-    [0.25, -1.0, 0.6]
-)  # ours: direction to the light
-# ours: brightness between these two as the surface normal turns from against to towards the sun (half
-# Lambert: faces away from the sun still differ, so no viewpoint hides a shape's edges)
+SUN = (0.24, -0.82, 0.52)  # ours: direction to the light, of length 1
+# ours: brightness goes from the first to the second as the surface turns from away to towards the
+# sun (half Lambert: faces away from the sun still differ, so no viewpoint hides a shape's edges)
 DARK, BRIGHT = 0.25, 1.0
 TABLE = (4.0, 2.0, 0.1)  # published code draws 8 x 4; the thickness is ours
 TABLE_GRAY = 120 / (DARK + (BRIGHT - DARK) * (1 + SUN[2]) / 2)  # ours: its top is 120 of 255
@@ -107,8 +114,9 @@ class Piece(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """One family's shape at scale 1, in Bullet's body frame: origin at the centre of mass, axes along
-    the principal axes of inertia. Its hull is the hull of `points` widened by a ball or a z-disc."""
+    """One family's shape at scale 1, in Bullet's body frame: origin at the centre of mass, axes
+    along the principal axes of inertia. It is as wide as `points` thickened by a ball or a z-disc.
+    """
 
     kind: str  # "box" | "hull" | "boxes" | "sphere" | "capsule" | "cylinder": how Bullet gets it
     pieces: tuple[Piece, ...]  # for the pictures
@@ -132,8 +140,11 @@ def _turn(angle: float, axis: int) -> np.ndarray:
     return rotation
 
 
-def _mass_properties(tets: np.ndarray, signs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Volume, centre of mass (3,), inertia (3, 3) per unit mass of a sum of tetrahedra (T, 4, 3)."""
+MassProperties = tuple[float, np.ndarray, np.ndarray]  # volume, centre (3,), inertia / mass (3, 3)
+
+
+def _mass_properties(tets: np.ndarray, signs: np.ndarray) -> MassProperties:
+    """Of a sum of tetrahedra (T, 4, 3), each added or (sign -1) taken away."""
     edges = tets[:, 1:] - tets[:, :1]  # (T, 3, 3)
     volumes = signs * np.abs(np.linalg.det(edges)) / 6  # (T,)
     com = (volumes[:, None] * tets.mean(1)).sum(0) / volumes.sum()
@@ -169,7 +180,7 @@ def _body(kind: str, pieces: list[Piece], points: np.ndarray, properties: tuple,
 
 
 def _prism_piece(polygon: np.ndarray) -> tuple[Piece, np.ndarray]:
-    """Half-spaces and corners of a convex polygon (n, 2), counter-clockwise in x, z, over |y| <= 1."""
+    """Half-spaces, corners of a convex polygon (n, 2), counter-clockwise in x, z, over |y| <= 1."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     outward = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -180,7 +191,7 @@ def _prism_piece(polygon: np.ndarray) -> tuple[Piece, np.ndarray]:
     return Piece(normals, offsets), corners
 
 
-def _prism_properties(polygon: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def _prism_properties(polygon: np.ndarray) -> MassProperties:
     """Mass properties of any simple polygon in x, z over |y| <= 1 (a fan of signed triangles)."""
     tets, signs = [], []
     for b, c in zip(polygon[1:-1], polygon[2:], strict=True):
@@ -222,8 +233,8 @@ def _pyramid(ring: np.ndarray) -> Solid:
 def _arch() -> Solid:
     """A 4x2x2 block with a tunnel of radius 1.25 along y, as five boxes.
 
-    published code: drawn with the tunnel but collides as a full block; ours: the tunnel is real, its
-    half-circle is half of a regular octagon, and the picture shows exactly what collides.
+    published code: drawn with the tunnel but collides as a full block; ours: the tunnel is real,
+    half of a regular octagon around the circle, and the picture shows exactly what collides.
     """
     radius, side = 1.25, 1.25 * math.tan(math.pi / 8)
     deep = 0.55  # the slanted boxes reach past the corners behind them, still inside the block
@@ -284,7 +295,7 @@ def _dome() -> Solid:
 
 
 class Family(NamedTuple):
-    """A grid of shapes: `scales` sizes in [lo, hi] times `angles` rotations about z in [0, turn)."""
+    """A grid of shapes: `scales` sizes in [lo, hi], each in `angles` rotations in [0, turn)."""
 
     name: str  # published code's name
     label: str  # class of Table 2
@@ -404,8 +415,8 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     """Train, validation and test ids, about 2:1:1 (A.4).
 
     Args:
-        split: "default" draws half of the scales of every family for training (all angles of a scale
-            stay together); "full" trains on the classes of Table 2's first row.
+        split: "default" draws half of the scales of every family for training (all angles of a
+            scale stay together); "full" trains on the classes of Table 2's first row.
         seed: of the draw of the scales and of the halving of the rest.
 
     Returns:
@@ -435,11 +446,11 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 # ---- pictures: one painter for states, action observations and colour pictures ----
 #
-# Along the ray eye + t d of a pixel, a plane n.x = c is met at t = (c - n.eye) / (n.d). The rays are
-# d = forward + u right + v up, so 1/t is an affine function of the pixel (u, v): one multiply-add per
-# pixel and plane. In w = 1/t, a convex piece is entered at the smallest w of the planes that the eye
-# is outside of and left at the largest w of the others; it is hit if it is entered before it is left.
-# Larger w = nearer to the eye, and w = 0 is infinitely far: a depth buffer that starts with zeros.
+# Along the ray eye + t d of a pixel, a plane n.x = c is met at t = (c - n.eye) / (n.d). The rays
+# are d = forward + u right + v up, so 1/t is an affine function of the pixel (u, v): one
+# multiply-add per pixel and plane. In w = 1/t, a convex piece is entered at the smallest w of the
+# planes that the eye is outside of and left at the largest w of the others; it is hit if it is
+# entered before it is left. Larger w = nearer; a depth buffer of zeros is infinitely far.
 
 
 class Camera(NamedTuple):
@@ -524,7 +535,7 @@ def _interval(
 
 def _paint(
     canvas: Canvas, camera: Camera, owner: int, solid: Solid, scale: float,
-    position: np.ndarray, rotation: np.ndarray, sun: np.ndarray = SUN,
+    position: np.ndarray, rotation: np.ndarray, sun: tuple[float, float, float] = SUN,
 ) -> None:  # fmt: skip
     """Add one body in the pose position (3,), rotation (3, 3) to the canvas."""
     eye = (camera.eye - position) @ rotation / scale  # body coordinates at scale 1
@@ -542,11 +553,36 @@ def _paint(
         return
     u, v = camera.grid[window[1]], -camera.grid[window[0], None]
     for piece in solid.pieces:
-        enter, leave, light = _interval(piece, eye, axes, sun @ rotation, u, v)
+        enter, leave, light = _interval(piece, eye, axes, np.array(sun) @ rotation, u, v)
         seen = (enter > leave) & (enter > near * np.float32(scale))
         np.copyto(near, enter / np.float32(scale), where=seen)
         np.copyto(canvas.light[window], light, where=seen)
         np.copyto(canvas.owner[window], owner, where=seen)
+
+
+@cache
+def _stage(
+    eye: tuple, target: tuple, size: int = SIZE, fov: float = FOV, sun: tuple = SUN
+) -> tuple[Camera, Canvas]:
+    """A camera, and a canvas with the empty table (body 0) that is never painted twice."""
+    corners = np.where(np.indices((2, 2, 2)).reshape(3, 8).T, TABLE, np.negative(TABLE))  # (8, 3)
+    piece = Piece(np.vstack([np.eye(3), -np.eye(3)]), np.array([*TABLE, *TABLE]))
+    table = SOLIDS[0]._replace(pieces=(piece,), box=corners)  # only these two matter here
+    camera, canvas = look(eye, target, size, fov), Canvas.blank(size)
+    _paint(canvas, camera, 0, table, 1.0, np.array([0, 0, -TABLE[2]]), np.eye(3), sun)
+    return camera, canvas
+
+
+def _paint_scene(
+    stage: tuple[Camera, Canvas], shape_ids: Sequence[int], positions: np.ndarray,
+    rotations: np.ndarray, sun: tuple = SUN,
+) -> Canvas:  # fmt: skip
+    """The table and n shapes, bodies 1..n, in the poses (n, 3) and (n, 3, 3)."""
+    camera, empty = stage
+    canvas = Canvas(*(layer.copy() for layer in empty))
+    for body, (shape_id, *pose) in enumerate(zip(shape_ids, positions, rotations, strict=True), 1):
+        _paint(canvas, camera, body, SOLIDS[shape_id], SHAPES[shape_id].scale, *pose, sun)
+    return canvas
 
 
 def _gray(canvas: Canvas, grays: np.ndarray) -> np.ndarray:
@@ -584,7 +620,7 @@ def _views_job(job: tuple[int, int, int]) -> np.ndarray:
 
 
 def _cache_path(cache_dir: str | Path, ids: np.ndarray, num: int, seed: int) -> Path:
-    """File name from all that the pictures depend on, the painter included (one view per family)."""
+    """File name from all the pictures depend on, the painter included (one view per family)."""
     firsts = [next(i for i, s in enumerate(SHAPES) if s.family == f) for f in range(len(FAMILIES))]
     digest = hashlib.sha256(repr((SHAPES, ids.tolist(), num, seed)).encode())
     digest.update(b"".join(_views(first, 1, 0).tobytes() for first in firsts))
@@ -608,7 +644,7 @@ def action_observations(
         action_ids: ids in 0..809.
         num_observations: views per shape, at least 1; view k is the same for every number > k.
         modality: "image" is the only one.
-        seed: one seed gives the same bytes, whatever `workers` and whichever other ids are asked for.
+        seed: one seed gives the same bytes, whatever `workers` and the other ids asked for.
         workers: processes.
         cache_dir: requests of CACHE_FROM pictures or more are kept there (all 810 x 1,024 views are
             5.9 GB) and come back as a copy-on-write memory map: only what is read is in memory,
@@ -676,28 +712,9 @@ def _load_pybullet() -> Any:
         import pybullet
     except ImportError as e:
         raise ImportError(
-            "Shape Stacking needs pybullet: pip install pybullet (ready-made for Python 3.11 at most)"
+            "Shape Stacking needs pybullet: pip install pybullet (its wheels end at Python 3.11)"
         ) from e
     return pybullet
-
-
-@lru_cache(maxsize=8)
-def _scene_camera(placement: str, size: int) -> tuple[Camera, Canvas]:
-    """The state's camera, and the canvas with the empty table."""
-    camera = look(RAISED_EYE, RAISED_TARGET, size)
-    if placement != "2d":
-        camera = look(FRONT_EYE, FRONT_TARGET, size)
-    canvas = Canvas.blank(size)
-    _paint(canvas, camera, 0, _table(), 1.0, np.array([0, 0, -TABLE[2]]), np.eye(3))
-    return camera, canvas
-
-
-@lru_cache(maxsize=1)
-def _table() -> Solid:
-    normals = np.vstack([np.eye(3), -np.eye(3)])
-    box = np.where(np.indices((2, 2, 2)).reshape(3, 8).T, TABLE, np.negative(TABLE))
-    piece = Piece(normals, np.array([*TABLE, *TABLE]))
-    return SOLIDS[0]._replace(pieces=(piece,), box=box)
 
 
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
@@ -735,9 +752,9 @@ class StackingEnv(gym.Env):
     """Build a tower from the shapes on offer (appendix A.4).
 
     ## Description
-    Two equal cylinders stand at random places on a line. Each action drops one shape over the tallest
-    thing in the scene, at the place the agent names; the simulation runs until all is at rest, at
-    most 300 steps of .01 s. Lengths are in units of about half the largest shape's width.
+    Two equal cylinders stand at random places on a line. Each action drops one shape, from above
+    the highest point of the scene, at the place the agent names; the simulation runs until all is
+    at rest, at most 300 steps of .01 s.
 
     ## Action Space
     `Dict`:
@@ -745,10 +762,11 @@ class StackingEnv(gym.Env):
     | key | space | meaning |
     |---|---|---|
     | choice | `Discrete(K)` | position in `available` of the shape to drop |
-    | position | `Box(-1, 1, (d,))` | where: x (1d), x and y (2d); no such key for placement "none" |
+    | position | `Box(-1, 1, (d,))` | where: x (1d), x and y (2d); no such key for "none" |
     | stop | `Discrete(2)` | 1: end the episode now, nothing is placed |
 
-    A shape that has been placed cannot be placed again: choosing it does nothing but use up the step.
+    A shape that has been placed cannot be placed again: choosing it only uses up the step. An
+    action outside of the space is refused with a ValueError before anything moves.
 
     ## Observation Space
     `Dict`: state `Box(0, 255, (4, 84, 84), uint8)`, the last four grayscale pictures, newest last,
@@ -756,8 +774,8 @@ class StackingEnv(gym.Env):
     offer, redrawn at every reset.
 
     ## Rewards
-    Eq. 4 on the last step, else 0: half the height of the highest shape plus half the mean height of
-    all shapes, the cylinders included. Heights are of centres of mass above the table.
+    Eq. 4 on the last step, else 0: half the height of the highest shape plus half the mean height
+    of all shapes, the cylinders included. Heights are of centres of mass above the table.
 
     ## Starting State
     Two copies of one of three cylinders (heights .66, .68, .71), their axes 1.0 to 1.6 apart.
@@ -767,12 +785,14 @@ class StackingEnv(gym.Env):
     step's info has `height` (of the highest shape) and `episode` (return "r", length "l").
 
     ## Arguments
-    action_pool: ids to draw from (default: the training split); num_available: K; render_mode: None or
-    "rgb_array"; placement: "none" (always over the centre), "1d" or "2d" (C.6); early_stop: False runs
-    the full 300 steps after every drop. ValueError for a pool smaller than K, unknown or repeated ids.
+    action_pool: ids to draw from (default: the training split); num_available: K (a pool of just K
+    ids is offered in order, always); render_mode: None or "rgb_array"; placement: "none" (always
+    over the centre), "1d" or "2d" (C.6); early_stop: False runs the full 300 steps after a drop.
+    ValueError for a pool smaller than K, for unknown or repeated ids, for an unknown option.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 12}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    _client = -1  # number of the physics client, -1: none yet
 
     def __init__(
         self,
@@ -784,10 +804,9 @@ class StackingEnv(gym.Env):
     ) -> None:
         pool = split_actions()["train"] if action_pool is None else action_pool
         self.action_pool = np.sort(check_ids(pool, distinct=True))
-        if not 1 <= num_available <= len(self.action_pool):
-            raise ValueError(
-                f"num_available must be in 1..{len(self.action_pool)} (the pool), got {num_available}"
-            )
+        size = len(self.action_pool)
+        if num_available not in range(1, size + 1):
+            raise ValueError(f"num_available must be in 1..{size} (the pool), got {num_available}")
         if placement not in PLACEMENTS:
             raise ValueError(f"unknown placement {placement!r}; allowed: {', '.join(PLACEMENTS)}")
         if render_mode not in (None, "rgb_array"):
@@ -806,7 +825,6 @@ class StackingEnv(gym.Env):
         self.action_space = spaces.Dict(parts)
         # The physics client is made in the first reset, so in the worker process of a vector env.
         self._bullet: Any = None
-        self._client = -1
         self._running = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
@@ -817,7 +835,7 @@ class StackingEnv(gym.Env):
             self.available = rng.choice(self.action_pool, self.num_available, replace=False)
         self._empty_world()
         cylinder = int(rng.choice(CYLINDERS))
-        # appendix: "random heights"; published code: one of three heights, the same for both, as here
+        # appendix: "random heights"; published code: one of three, the same for both, as here
         centre, gap = rng.uniform(*CENTRE), rng.uniform(*AXIS_GAP)
         for x in (centre - gap / 2, centre + gap / 2):
             self._add(cylinder, float(x), 0.0, lowest_z=DROP_GAP)
@@ -826,6 +844,7 @@ class StackingEnv(gym.Env):
         self._steps = 0
         self._running = True
         self._stack = np.zeros((FRAMES, SIZE, SIZE), dtype=np.uint8)
+        self._picture = self._draw()
         return self._observe(), {}
 
     def step(self, action: dict) -> tuple[dict, float, bool, bool, dict]:
@@ -839,6 +858,7 @@ class StackingEnv(gym.Env):
         if not stop and shape_id not in self._placed:  # A.4: trying to place it again does nothing
             self._placed.add(shape_id)
             self._drop(shape_id, x, y)
+            self._picture = self._draw()
         terminated, truncated = stop, not stop and self._steps == MAX_STEPS
         reward, info = 0.0, {}
         if terminated or truncated:
@@ -869,7 +889,7 @@ class StackingEnv(gym.Env):
         return numbers["choice"], (place[0], place[1]), bool(numbers["stop"])
 
     def _empty_world(self) -> None:
-        """A fresh simulation with a table; made anew for each episode, so that none leaves traces."""
+        """A fresh simulation with a table, for each episode anew, so that none leaves traces."""
         if self._client < 0:
             self._bullet = _load_pybullet()
             self._client = self._bullet.connect(self._bullet.DIRECT)
@@ -914,7 +934,7 @@ class StackingEnv(gym.Env):
         )
 
     def _add(self, shape_id: int, x: float, y: float, lowest_z: float) -> None:
-        """Put an upright shape into the scene: its origin over (x, y), its lowest point at lowest_z."""
+        """Add an upright shape: its origin over (x, y), its lowest point at the height lowest_z."""
         p, client, shape, solid = self._bullet, self._client, SHAPES[shape_id], SOLIDS[shape_id]
         com = _turn(shape.angle, axis=2) @ solid.com * shape.scale  # from the origin, in the world
         position = [x + float(com[0]), y + float(com[1]), lowest_z + lowest(shape_id)]
@@ -925,9 +945,10 @@ class StackingEnv(gym.Env):
         )  # fmt: skip
         # Bullet would take the inertia of the bounding box. Mass must be given along with the
         # inertia: alone, it makes the body massless and its pose NaN.
+        inertia = (MASS * solid.inertia * shape.scale**2).tolist()
         p.changeDynamics(
-            body, -1, mass=MASS, localInertiaDiagonal=(solid.inertia * shape.scale**2 * MASS).tolist(),
-            **FRICTION, restitution=0, linearDamping=0, angularDamping=0, physicsClientId=client,
+            body, -1, mass=MASS, localInertiaDiagonal=inertia, **FRICTION, restitution=0,
+            linearDamping=0, angularDamping=0, physicsClientId=client,
         )  # fmt: skip
         self._bodies.append(body)
         self.shape_ids.append(shape_id)
@@ -943,7 +964,7 @@ class StackingEnv(gym.Env):
         """Simulate until at rest, at most 300 steps."""
         p, client, quiet = self._bullet, self._client, 0
         for done in range(CHECK_EVERY, SIM_STEPS + 1, CHECK_EVERY):
-            if self.render_mode is not None and done % (2 * CHECK_EVERY) == CHECK_EVERY:
+            if self.render_mode is not None:
                 self._trace.append(self.poses())
             for _ in range(CHECK_EVERY):
                 p.stepSimulation(physicsClientId=client)
@@ -961,7 +982,7 @@ class StackingEnv(gym.Env):
         return True
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres of mass (n, 3) and rotations (n, 3, 3) of the shapes in the scene (`shape_ids`)."""
+        """Centres of mass (n, 3), rotations (n, 3, 3) of the shapes in the scene (`shape_ids`)."""
         pairs = [
             self._bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
             for body in self._bodies
@@ -978,22 +999,24 @@ class StackingEnv(gym.Env):
             highest = max(highest, float(position[2]) + reach)
         return highest
 
+    def _draw(self) -> np.ndarray:
+        """The scene as the agent sees it, (84, 84) uint8."""
+        stage = _stage(*(RAISED if self.placement == "2d" else FRONT))
+        canvas = _paint_scene(stage, self.shape_ids, *self.poses())
+        return _gray(canvas, np.concatenate([[TABLE_GRAY], GRAYS[self.shape_ids]]))
+
     def _observe(self) -> dict[str, np.ndarray]:
-        """A.4 State: push a picture of the scene onto the stack of four."""
-        camera, empty = _scene_camera(self.placement, SIZE)
-        canvas = Canvas(*(layer.copy() for layer in empty))
-        for owner, (shape_id, *pose) in enumerate(
-            zip(self.shape_ids, *self.poses(), strict=True), 1
-        ):
-            _paint(canvas, camera, owner, SOLIDS[shape_id], SHAPES[shape_id].scale, *pose)
-        picture = _gray(canvas, np.concatenate([[TABLE_GRAY], GRAYS[self.shape_ids]]))
-        self._stack = np.concatenate([self._stack[1:], picture[None]])  # (4, 84, 84)
+        """A.4 State: push the picture onto the stack of four."""
+        self._stack = np.concatenate([self._stack[1:], self._picture[None]])  # (4, 84, 84)
         return {"state": self._stack.copy(), "available": self.available.astype(np.int64)}
 
     def close(self) -> None:
         if self._client >= 0:
             self._bullet.disconnect(physicsClientId=self._client)
         self._client, self._running = -1, False
+
+    def __del__(self) -> None:
+        self.close()
 
     # ---- colour pictures, only for people ----
 
@@ -1004,13 +1027,13 @@ class StackingEnv(gym.Env):
         return colour_picture(self.shape_ids, *self.poses(), caption=self._caption())
 
     def render_frames(self) -> list[np.ndarray]:
-        """Colour frames of the last reset or step, the fall included: a list of (360, 360, 3) uint8.
+        """Colour frames of the last reset or step, the fall included, each (360, 360, 3) uint8.
 
-        Empty without render_mode. The poses are recorded while simulating, painted only here.
+        Empty without render_mode. Poses are recorded while simulating and painted only here.
         """
         if self.render_mode is None or not self._bodies:
             return []
-        moments = self._trace[:6] + self._trace[6::4]  # the fall in full, the settling in brief
+        moments = self._trace[:12:2] + self._trace[12::6]  # the settling in brief
         frames = [
             colour_picture(self.shape_ids[: len(pose[0])], *pose, caption=self._caption(pose))
             for pose in moments
@@ -1064,37 +1087,29 @@ gym.register(id="ActionGen/Stacking-v0", entry_point="stacking_env:StackingEnv")
 # ---- colour pictures (ours; the agent never sees them) ----
 
 COLOUR_SIZE = 360
-COLOUR_EYE, COLOUR_TARGET, COLOUR_FOV = (1.6, -9.0, 4.2), (0.0, 0.0, 2.0), 38.0
-COLOUR_SUN = np.array([-0.55, -0.5, 1.0]) / np.linalg.norm([-0.55, -0.5, 1.0])
-WOOD, SKY_TOP, SKY_LOW = (0.87, 0.80, 0.70), (0.80, 0.87, 0.94), (0.97, 0.97, 0.96)
-
-
-def _paint_scene(
-    camera: Camera, shape_ids: Sequence[int], positions: Any, rotations: Any
-) -> Canvas:
-    """Table (owner 0) and shapes (owners 1, 2, ...) under the sun of the colour pictures."""
-    canvas = Canvas.blank(len(camera.grid))
-    middle = np.array([0, 0, -TABLE[2]])
-    _paint(canvas, camera, 0, _table(), 1.0, middle, np.eye(3), COLOUR_SUN)
-    for owner, (shape_id, *pose) in enumerate(zip(shape_ids, positions, rotations, strict=True), 1):
-        _paint(canvas, camera, owner, SOLIDS[shape_id], SHAPES[shape_id].scale, *pose, COLOUR_SUN)
-    return canvas
+COLOUR_EYE, COLOUR_TARGET, COLOUR_FOV = (0.0, -10.5, 5.0), (0.0, 0.0, 2.45), 38.0
+COLOUR_SUN = (-0.44, -0.40, 0.804)
+SUN_EYE = (-11.0, -10.0, 20.1)  # 25 along it
+WOOD, SKY = (0.93, 0.87, 0.78), (0.92, 0.95, 0.98)
 
 
 def _sunlit(camera: Camera, canvas: Canvas, sun_camera: Camera, sun_canvas: Canvas) -> np.ndarray:
     """Share of the sun that reaches each pixel (H, W): what the sun does not see is in shadow."""
-    size = len(sun_camera.grid)
-    u, v = camera.grid[None, :, None], -camera.grid[:, None, None]
-    rays = u * camera.axes[0] + v * camera.axes[1] + camera.axes[2]  # (H, W, 3)
-    points = camera.eye + rays / np.maximum(canvas.near, 1e-3)[..., None]
-    right, up, ahead = np.moveaxis((points - sun_camera.eye) @ sun_camera.axes.T, 2, 0)
-    column = sun_camera.focal * right / ahead + size / 2
-    row = -sun_camera.focal * up / ahead + size / 2
-    lit = np.zeros(canvas.near.shape)
-    for down, across in ((-1, 0), (1, 0), (0, -1), (0, 1)):  # four samples soften the edge
-        i = np.clip(row + 1.2 * down, 0, size - 1).astype(int)
-        j = np.clip(column + 1.2 * across, 0, size - 1).astype(int)
-        lit += ahead < 1 / np.maximum(sun_canvas.near[i, j], 1e-3) + 0.04
+    size, axes = len(sun_camera.grid), sun_camera.axes.T
+    u, v, depth = camera.grid, -camera.grid[:, None], 1 / np.maximum(canvas.near, 1e-3)
+    start = ((camera.eye - sun_camera.eye) @ axes).astype(np.float32)  # the eye as the sun sees it
+    turned = (camera.axes @ axes).astype(np.float32)  # and the rays u right + v up + forward
+    right, up, ahead = (
+        start[k] + depth * (u * turned[0, k] + (v * turned[1, k] + turned[2, k])) for k in range(3)
+    )  # each (H, W)
+    scale = sun_camera.focal / ahead
+    column, row = scale * right + size / 2, size / 2 - scale * up
+    reach = 1 / np.maximum(sun_canvas.near, 1e-3) + 0.08  # how far the sun sees, with some slack
+    lit = np.zeros(canvas.near.shape, np.float32)
+    for down, across in ((-1.2, 0), (1.2, 0), (0, -1.2), (0, 1.2)):  # four samples: soft edges
+        i = np.clip((row + down).astype(np.int32), 0, size - 1)
+        j = np.clip((column + across).astype(np.int32), 0, size - 1)
+        lit += ahead < reach[i, j]
     return lit / 4
 
 
@@ -1113,22 +1128,22 @@ def colour_picture(
         caption: a line of text at the top; view: eye, target and field of view of the camera.
     """
     fine = 2 * size  # painted at twice the size, then averaged: smooth edges
-    camera = look(view[0], view[1], fine, view[2])
-    sun_camera = look(25 * COLOUR_SUN, (0, 0, 1), 3 * size, 20)
-    canvas = _paint_scene(camera, shape_ids, positions, rotations)
-    shadow_map = _paint_scene(sun_camera, shape_ids, positions, rotations)
-    lit = _sunlit(camera, canvas, sun_camera, shadow_map)
-    colours = np.vstack([[WOOD], COLOURS[list(shape_ids)]])
+    camera, sun_camera = (
+        _stage(*view[:2], fine, view[2], COLOUR_SUN),
+        _stage(SUN_EYE, (0, 0, 1), 3 * size, 20.0, COLOUR_SUN),
+    )
+    bodies = (shape_ids, positions, rotations, COLOUR_SUN)
+    canvas, shadow_map = _paint_scene(camera, *bodies), _paint_scene(sun_camera, *bodies)
+    lit = _sunlit(camera[0], canvas, sun_camera[0], shadow_map)
+    colours = np.vstack([[WOOD], COLOURS[list(shape_ids)]]).astype(np.float32)
     bright = 0.5 + 0.12 * canvas.light + 0.45 * np.maximum(canvas.light, 0) * lit
-    rgb = colours[canvas.owner] * bright[..., None]  # (H, W, 3)
-    fade = np.linspace(0, 1, fine)[:, None, None]
-    sky = np.array(SKY_TOP) * (1 - fade) + np.array(SKY_LOW) * fade
-    rgb = np.where(canvas.near[..., None] > 0, rgb, sky)
-    rgb = rgb.reshape(size, 2, size, 2, 3).mean((1, 3))  # (size, size, 3)
+    rgb = colours[canvas.owner] * bright[..., None]  # (2 size, 2 size, 3)
+    rgb[canvas.near == 0] = SKY
+    rgb = (rgb[::2, ::2] + rgb[1::2, ::2] + rgb[::2, 1::2] + rgb[1::2, 1::2]) / 4
     image = Image.fromarray((255 * np.clip(rgb, 0, 1)).round().astype(np.uint8))
     if caption:
         font = ImageFont.load_default(size=size // 24)
-        ImageDraw.Draw(image).text((size // 36, size // 45), caption, fill=(60, 66, 80), font=font)
+        ImageDraw.Draw(image).text((size // 36, size // 45), caption, fill=(60, 50, 40), font=font)
     return np.asarray(image)
 
 
@@ -1141,8 +1156,8 @@ FLAT |= {"rectangle": (2, 4), "cylinder": (2, 2)}  # family: width, height at sc
 def greedy_plan(available: Sequence[int]) -> list[int]:
     """Order of positions in `available` for a flat tower, at most ten (ours; not in the appendix).
 
-    The nine tallest shapes with flat top and bottom, widest first, then the tallest of the rest. All
-    dropped over one cylinder they reach a mean height of about 5.4, where random play reaches 1.6.
+    The nine tallest shapes with flat top and bottom, widest first, then the tallest of the rest.
+    All over one cylinder they reach a height of about 5.4 on average; random play reaches 1.6.
     """
     flat, rest = [], []
     for slot, shape_id in enumerate(available):
@@ -1161,7 +1176,7 @@ def greedy_plan(available: Sequence[int]) -> list[int]:
 
 
 def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, list[np.ndarray]]:
-    """One episode without stopping; returns the final height and the colour frames (if rendering)."""
+    """One episode without stopping; returns the height and the colour frames (if rendering)."""
     obs, _ = env.reset(seed=seed)
     rng = np.random.default_rng(seed)
     frames = env.render_frames()
@@ -1181,37 +1196,41 @@ def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, li
     return info[METRIC], frames
 
 
-def save_gif(frames: Sequence[np.ndarray], path: Path, fps: int = 12) -> None:
-    """Write an animation (the last picture stays two seconds); all or nothing."""
+def save_gif(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    """Write pictures as an endless GIF; the last one stays for 1.5 s. Creates missing folders."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    images = [Image.fromarray(frame).quantize(128) for frame in frames]
-    durations = [1000 // fps] * (len(images) - 1) + [2000]
-    part = path.with_suffix(".part")
+    durations = [round(1000 / fps)] * (len(frames) - 1) + [1500]  # ours: time to see the outcome
+    images = [Image.fromarray(frame).quantize(255) for frame in frames]
+    part = path.with_name(path.name + ".part")  # a reader never meets a half-written file
     images[0].save(part, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
     os.replace(part, path)
 
 
-def shape_sheet(size: int = 168) -> Image.Image:
-    """All 16 families: the smallest, a middle and the largest shape in colour, and three views."""
-    rows = []
-    font = ImageFont.load_default(size=15)
+def _portrait(shape_id: int, size: int) -> np.ndarray:
+    """One shape standing on the table, in colour, (size, size, 3) uint8."""
+    shape, solid = SHAPES[shape_id], SOLIDS[shape_id]
+    upright = _turn(shape.angle, axis=2)
+    middle = solid.points.mean(0)  # centred on the picture, not on the centre of mass
+    rotation = upright @ _turn(solid.tilt, axis=1)
+    position = -(rotation @ middle) * (shape.scale, shape.scale, 0) + (0, 0, lowest(shape_id))
+    view = ((0.0, -3.6, 2.0), (0.0, 0.0, 0.45), 32.0)
+    return colour_picture([shape_id], position[None], rotation[None], size, "", view)
+
+
+def shape_sheet(size: int = 150) -> Image.Image:
+    """All 16 families: smallest, middle and largest shape in colour, three views of the largest."""
+    rows, font = [], ImageFont.load_default(size=15)
     for index, family in enumerate(FAMILIES):
         ids = [i for i, shape in enumerate(SHAPES) if shape.family == index]
-        picked = [ids[0], ids[len(ids) // 2], ids[-1]]
-        cells = []
-        for shape_id in picked:
-            shape, solid = SHAPES[shape_id], SOLIDS[shape_id]
-            upright = _turn(shape.angle, axis=2)
-            position = upright @ solid.com * shape.scale * (1, 1, 0) + (0, 0, lowest(shape_id))
-            rotation = upright @ _turn(solid.tilt, axis=1)
-            view = ((0.9, -3.2, 1.9), (0, 0, 0.38), 32)
-            cells.append(colour_picture([shape_id], position[None], rotation[None], size, "", view))
+        middle = family.scales // 2 * family.angles + 2 % family.angles
+        picked = [ids[1 % family.angles], ids[middle], ids[-1]]
+        cells = [_portrait(shape_id, size) for shape_id in picked]
         for view in _views(ids[-1], 3, 0):
             gray = Image.fromarray(view).resize((size, size), Image.Resampling.NEAREST)
             cells.append(np.asarray(gray.convert("RGB")))
         row = Image.fromarray(np.concatenate(cells, axis=1))
-        text = f"{family.name} ({len(ids)})"
-        ImageDraw.Draw(row).text((6, 4), text, fill=(40, 44, 56), font=font)
+        text = f"{family.name}: {len(ids)}, {family.label}"
+        ImageDraw.Draw(row).text((8, 5), text, fill=(60, 50, 40), font=font)
         rows.append(np.asarray(row))
     left, right = np.concatenate(rows[:8]), np.concatenate(rows[8:])
     gap = np.full((len(left), 12, 3), 255, dtype=np.uint8)
@@ -1220,49 +1239,49 @@ def shape_sheet(size: int = 168) -> Image.Image:
 
 @dataclass
 class Args:
-    """Build one tower, write it as a GIF, and summarise the action set."""
+    """Build a planned and a random tower, draw the shapes, print a summary."""
 
+    seed: int = 0
+    """seed of the split and of the episodes"""
     out: Path = Path("runs/demo")
-    """folder for the pictures"""
-    policy: Literal["greedy", "random"] = "greedy"
-    """greedy: flat shapes over one cylinder, widest first; random: any shape anywhere"""
-    placement: Literal["none", "1d", "2d"] = "1d"
-    """where the agent may drop shapes (C.6, Figure 13)"""
+    """folder for the GIFs and the sheet"""
     split: Literal["default", "full"] = "default"
-    """action set split (A.4, Table 2)"""
-    pool: Literal["train", "valid", "test"] = "train"
+    """how the shapes are divided (A.4, Table 2)"""
+    pool: Literal["train", "valid", "test"] = "test"
     """part of the split whose shapes are on offer"""
     num_available: int = NUM_AVAILABLE
-    """shapes on offer per episode (Table 3)"""
-    seed: int = 0
-    """seed of the episode and of the split"""
+    """shapes on offer in an episode (Table 3)"""
+    placement: Literal["none", "1d", "2d"] = "1d"
+    """where the agent may drop shapes (C.6)"""
     show_shapes: bool = False
-    """also write a sheet of all shape families"""
+    """also draw a sheet of all shape families"""
 
 
 def main(args: Args) -> None:
-    """The command line: see the top of the file."""
+    """The script: see the top of the file."""
     parts = split_actions(args.split, args.seed)
     env = StackingEnv(parts[args.pool], args.num_available, "rgb_array", placement=args.placement)
-    height, frames = play(env, args.seed, args.policy)
-    env.close()
-    save_gif(frames, args.out / "stacking.gif", env.metadata["render_fps"])
-    print(f"{NUM_ACTIONS} shapes:", end=" ")
     labels, counts = np.unique(action_labels(), return_counts=True)
-    print(", ".join(f"{count} {label}" for label, count in zip(labels, counts, strict=True)))
-    print(f"{args.split} split:", ", ".join(f"{len(ids)} {name}" for name, ids in parts.items()))
-    print(f"{args.policy} tower of {args.pool} shapes, seed {args.seed}: height {height:.2f}")
-    print(f"wrote {args.out / 'stacking.gif'} ({len(frames)} frames)")
+    print(f"{NUM_ACTIONS} shapes; {args.split} split {args.seed}, {args.num_available} on offer:")
+    print("  " + " ".join(f"{text:>8}" for text in ("all", *parts)) + "  class")
+    for label, count in zip(labels, counts, strict=True):
+        row = [count] + [int((action_labels()[ids] == label).sum()) for ids in parts.values()]
+        print("  " + " ".join(f"{number:8}" for number in row) + f"  {label}")
+    for policy in ("greedy", "random"):
+        height, frames = play(env, args.seed, policy)
+        path = args.out / f"stacking_{policy}.gif"
+        save_gif(path, frames, env.metadata["render_fps"])
+        print(f"{policy} tower of {args.pool} shapes: height {height:.2f}, wrote {path}")
+    env.close()
     if args.show_shapes:
         path = args.out / "stacking_shapes.png"
-        part = path.with_suffix(".part")
-        shape_sheet().save(part, "PNG")
-        os.replace(part, path)
+        shape_sheet().save(path.with_suffix(".part"), "PNG")
+        os.replace(path.with_suffix(".part"), path)
         print(f"wrote {path}")
 
 
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args))
-    except (ValueError, FileNotFoundError, ImportError) as e:
-        raise SystemExit(f"error: {e}") from e
+    except (ValueError, OSError, ImportError) as error:
+        raise SystemExit(f"error: {error}") from None
