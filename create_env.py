@@ -287,7 +287,7 @@ SPLITS = ("default", "full", "analysis")
 
 
 def primary_values() -> np.ndarray:
-    """What tools are split by, int64 (NUM_ACTIONS,) degrees: angle, or a see-saw's largest angle."""
+    """What tools are split by, int64 (NUM_ACTIONS,) degrees: angle, or a see-saw's limit."""
     return np.array([tool.max_angle or tool.angle for tool in TOOLS], np.int64)
 
 
@@ -1069,7 +1069,8 @@ class CreateEnv(gymnasium.Env):
     `action_pool` ids (default: training split), `num_available` K, `task` one of `TASKS`,
     `subgoal_reward=False` pays neither subgoals nor target-hit (C.3), `tool_cost` is taken off the
     goal and each subgoal per placed tool (0.0; the published curves were made with 0.1),
-    `render_size` pixels of the colour picture. Bad arguments or actions raise ValueError and change nothing.
+    `render_size` pixels of the colour picture. Bad arguments or actions raise ValueError and change
+    nothing.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
@@ -1386,7 +1387,7 @@ def make_vec(
 
     `async_envs`: one process per environment (True), all in this process (False), or by the number
     of cores (None). Both give the same bytes. Environment i starts from seed + i; `reset()` without
-    a seed continues from there, `reset(seed=s)` reseeds with s + i. Raises ValueError as `CreateEnv`.
+    a seed continues from there, `reset(seed=s)` reseeds with s + i. ValueErrors as `CreateEnv`.
     """
     if num_envs < 1 or seed < 0:
         raise ValueError(f"num_envs must be 1 or more and seed 0 or more, got {num_envs}, {seed}")
@@ -1947,16 +1948,16 @@ def save_gif(frames: Sequence[np.ndarray], path: Path, fps: int = 15) -> None:
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
 
 
-def play_episode(task: str, seed: int, render: bool) -> tuple[list[np.ndarray], float, int]:
+def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, int]:
     """A random episode: (colour frames, return, length). A tool is tried on half the steps."""
-    env = CreateEnv(task=task, render_mode="rgb_array" if render else None)
     env.reset(seed=seed)
-    rng, frames, over = np.random.default_rng(seed), [env.render()], False
+    watched = env.render_mode is not None
+    rng, frames, over = np.random.default_rng(seed), env.render_frames() if watched else [], False
     while not over:
         choice = int(rng.integers(1, NUM_AVAILABLE)) if rng.random() < 0.5 else 0
         action = {"choice": choice, "position": rng.uniform(-0.9, 0.9, 2)}
         _, _, terminated, truncated, info = env.step(action)
-        frames += env.render_frames() if render else []
+        frames += env.render_frames() if watched else []
         over = terminated or truncated
     return frames, info["episode"]["r"], info["episode"]["l"]
 
@@ -2054,7 +2055,11 @@ def main(args: Args) -> None:
             for wanted, name, draw in (
                 (args.all_tasks, "create_tasks.png", all_tasks_sheet),
                 (args.show_tools, "create_tools.png", tools_sheet),
-                (args.show_probe, "create_probe.png", lambda: probe_sheet(args.show_probe)),
+                (
+                    args.show_probe is not None,
+                    "create_probe.png",
+                    lambda: probe_sheet(args.show_probe),
+                ),
             ):
                 if wanted:
                     draw().save(args.out / name)
@@ -2065,8 +2070,10 @@ def main(args: Args) -> None:
                 f"tries must be 1 or more and seed 0 or more, got {args.tries}, {args.seed}"
             )
         seeds = range(args.seed, args.seed + args.tries)
-        best = max(seeds, key=lambda seed: play_episode(args.task, seed, render=False)[1])
-        frames, total, length = play_episode(args.task, best, render=True)
+        env = CreateEnv(task=args.task)
+        best = max(seeds, key=lambda seed: play_episode(env, seed)[1])
+        env = CreateEnv(task=args.task, render_mode="rgb_array")
+        frames, total, length = play_episode(env, best)
         path = args.out / f"create_{args.task}.gif"
         save_gif(frames, path)
     except (ValueError, FileNotFoundError) as e:

@@ -218,7 +218,7 @@ def learner() -> Iterator[Row]:
 
 @group
 def create() -> Iterator[Row]:
-    """CREATE: every task with random placements, picture included; batches of 32; the probe ball."""
+    """CREATE: every task, random placements, picture included; batches of 32; the probe ball."""
     import numpy as np
 
     import create_env
@@ -276,6 +276,113 @@ def create() -> Iterator[Row]:
     yield "create: probe ball, 1,024 trajectories", 1 / per_tool, "tools/s", "2.3", note
     minutes = per_tool * create_env.NUM_DEFAULT / 60 / 2
     yield "  all 2,111 tools on 2 cores, extrapolated", minutes, "minutes", "8", "aim"
+
+
+@group
+def stacking() -> Iterator[Row]:
+    """Per CPU second of one core, random policy without stopping: where a step's time goes."""
+    import numpy as np
+
+    import stacking_env as stack
+
+    clock, spent, count = time.process_time, {}, {"steps": 0, "bare": 0.0, "plain": 0}
+
+    def timed(name: str) -> Callable:
+        """The method of the environment, its CPU time added to spent[name]."""
+        method = getattr(stack.StackingEnv, name)
+
+        def call(self, *args, **kwargs):
+            start = clock()
+            result = method(self, *args, **kwargs)
+            spent[name] = spent.get(name, 0.0) + clock() - start
+            return result
+
+        return call
+
+    names = ("_settle", "_draw", "_add", "top", "_empty_world")
+    env = type("Timed", (stack.StackingEnv,), {name: timed(name) for name in names})()
+    plain = stack.StackingEnv(early_stop=False)
+
+    def bare_loop(seed: int) -> None:
+        """A.4 to the letter on the same actions: 300 steps after each, repeats included."""
+        rng = np.random.default_rng(seed)
+        plain.reset(seed=seed)
+        for _ in range(stack.MAX_STEPS):
+            choice, place = rng.integers(plain.num_available), rng.uniform(-1, 1, 1)
+            shape_id, start = int(plain.available[choice]), clock()
+            if shape_id not in plain._placed:
+                plain._placed.add(shape_id)
+                plain._add(shape_id, float(place[0]), 0.0, plain.top() + stack.DROP_GAP)
+            loop = clock()
+            for _ in range(stack.SIM_STEPS):
+                plain._bullet.stepSimulation(physicsClientId=plain._client)
+            count["bare"] += clock() - loop
+            plain._draw()
+            count["plain"] += clock() - start
+
+    stack.play(env, 0, "random")  # warm up
+    spent.clear()
+    total, episodes = 0.0, 40
+    for seed in range(episodes):  # taking turns, so that a busy machine slows both alike
+        start = clock()
+        stack.play(env, seed, "random")
+        total += clock() - start
+        bare_loop(seed)
+    steps = episodes * stack.MAX_STEPS
+    ours, loop, reference = steps / total, steps / count["plain"], "fact-sheet machine"
+    yield "Stacking, step incl. picture and resets, random", ours, "steps/s/core", "70", reference
+    yield "Stacking, plain loop: 300 steps after each action", loop, "steps/s/core", "26", reference
+    yield "  ratio of the two", ours / loop, "x", ">= 2.5", "aim"
+    yield (
+        "  bare: 300 x stepSimulation and nothing else",
+        steps / count["bare"],
+        "steps/s/core",
+        "",
+        "",
+    )
+    words = ("simulating", "picture", "adding a shape", "top of the scene", "new world")
+    shares = [f"{w} {100 * spent[n] / total:.0f}" for w, n in zip(words, names, strict=True)]
+    rest = 100 * (1 - sum(spent.values()) / total)
+    what = "  profile: simulating, % of a step"
+    yield what, 100 * spent["_settle"] / total, "%", "", ", ".join([*shares, f"rest {rest:.0f}"])
+    yield from stacking_views()
+
+
+def stacking_views() -> Iterator[Row]:
+    """Viewpoint pictures: a stratified part of 810 x 1,024, and Bullet's renderer on one shape."""
+    import numpy as np
+    import pybullet as p
+
+    import stacking_env as stack
+
+    ids = np.arange(0, stack.NUM_ACTIONS, 10)  # a tenth of every family, all sizes
+    start, views = time.process_time(), 64
+    stack.action_observations(ids, views, seed=0)
+    per_second = len(ids) * views / (time.process_time() - start)
+    minutes = stack.NUM_ACTIONS * 1024 / per_second / 60
+    note = f"extrapolated to 810 x 1,024: {minutes:.1f} CPU min, {minutes / 2:.1f} min on 2 cores"
+    yield "Stacking, views of 84 x 84", per_second, "views/s/core", ">= 691", note + " (aim 10)"
+    env, cylinder = stack.StackingEnv(), 800
+    env._empty_world()
+    env._add(cylinder, 0.0, 0.0, 1.0)
+    view = p.computeViewMatrix((2, 0, 2), (0, 0, 1), (0, 0, 1))
+    lens = p.computeProjectionMatrixFOV(stack.FOV, 1, 0.1, 20)
+    options = {"renderer": p.ER_TINY_RENDERER, "shadow": 0, "physicsClientId": env._client}
+    start = time.process_time()
+    for _ in range(200):
+        p.getCameraImage(stack.SIZE, stack.SIZE, view, lens, **options)
+    theirs = 200 / (time.process_time() - start)
+    start = time.process_time()
+    stack._views(cylinder, 1000, 0)
+    ours = 1000 / (time.process_time() - start)
+    yield (
+        "  one cylinder, this painter",
+        ours,
+        "views/s/core",
+        f"{theirs:.0f}",
+        "TinyRenderer, same run",
+    )
+    env.close()
 
 
 def main() -> None:
