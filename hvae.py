@@ -77,68 +77,37 @@ PERPLEXITY = 10  # published code: t-SNE
 class Args:
     """Train an action encoder and write one representation per action.
 
-    A value of None stands for the environment's or the recipe's own."""
+    None stands for the value of the environment or the recipe."""
 
-    env: Annotated[str, tyro.conf.Positional] = "gridworld"
-    """gridworld, create or stacking"""
-    modality: str | None = None
-    """what is observed (B): xy, onehot | xy, state, video | image"""
-    hierarchical: bool = True
-    """HVAE; --no-hierarchical: the plain VAE baseline (B)"""
-    train_on: Literal["train", "all"] = "train"
-    """actions that the encoder is trained on; all of the split: the oracle encoder (C)"""
-    split: str = "default"
-    """split of the actions: default, full, ..."""
-    split_seed: int = 0
-    """seed of the split"""
-    seed: int = 0
-    """seed of weights, batches and latent samples"""
-    recipe: Literal["laptop", "quick", "paper"] = "laptop"
-    """paper: Tables 3-4 as written; laptop: as good in minutes; quick: in one minute"""
-    device: str = "auto"
-    """cpu, cuda, or auto"""
-    runs_dir: str = "runs"
-    """results go to <runs_dir>/hvae"""
-    representation_size: int | None = None
-    """Table 3: size of c and of z: 16 grid, 128 CREATE and Stacking"""
-    batch_size: int | None = None
-    """Table 3: actions per update: 128 grid and CREATE, 32 Stacking"""
-    epochs: int | None = None
-    """Table 3: passes over the actions: 10,000 grid and CREATE, 5,000 Stacking"""
-    updates: int | None = None
-    """number of updates, instead of epochs"""
-    learning_rate: float | None = None
-    """Table 4: 0.001 (RAdam)"""
-    observations: int | None = None
-    """Table 4: observations recorded of each action: 1,024"""
-    batch_observations: int | None = None
-    """observations of each action in one update (paper: all)"""
-    set_size: int | None = None
-    """observations that share the price KL(q(c|X)) of one c; None: those of an update"""
-    table_observations: int | None = None
-    """observations of each action behind its representation (paper: all)"""
-    q_hidden: int | None = None
-    """Table 4: width of q(c|X): 128"""
-    hidden: int | None = None
-    """Table 4: default width: 64 (128 for pictures and video, published code)"""
-    encoder: Literal["lstm", "mlp"] | None = None
-    """encoder of trajectories: lstm (D.3.1), mlp (beyond the paper, faster)"""
-    relative: bool | None = None
-    """states relative to the first one, instead of raw"""
-    compact: bool | None = None
-    """Bi-LSTM with half the width per direction, concatenated"""
-    log_var_lr: float | None = None
-    """learning rate of free log-variances, in multiples of the learning rate"""
-    decoder_log_var: float | None = None
-    """start of the decoder's log-variance; None: from N(0, 1) (published code)"""
-    cosine: bool | None = None
-    """learning rate falls to 0 along a half cosine, instead of staying constant"""
-    workers: int = 0
-    """processes that record observations, 0: one per core; any number records the same"""
-    threads: int = 2
-    """CPU threads; a run repeats bit for bit with the same number of threads"""
-    plots: bool = True
-    """draw the t-SNE and reconstruction pictures"""
+    env: Annotated[str, tyro.conf.Positional] = "gridworld"  # gridworld, create or stacking
+    modality: str | None = None  # what is observed (B): xy, onehot | xy, state, video | image
+    hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline (B)
+    train_on: Literal["train", "all"] = "train"  # all actions of the split: the oracle encoder (C)
+    split: str = "default"  # split of the actions: default, full, ...
+    split_seed: int = 0  # seed of the split
+    seed: int = 0  # seed of weights, batches and latent samples
+    recipe: Literal["laptop", "quick", "paper"] = "laptop"  # paper: Tables 3-4; quick: a minute
+    device: str = "auto"  # cpu, cuda, or auto
+    runs_dir: str = "runs"  # results go to <runs_dir>/hvae
+    representation_size: int | None = None  # Table 3: of c and of z: 16 grid, 128 others
+    batch_size: int | None = None  # Table 3: actions per update: 128 grid, CREATE; 32 Stacking
+    epochs: int | None = None  # Table 3: passes over the actions: 10,000; 5,000 Stacking
+    updates: int | None = None  # number of updates, instead of epochs
+    learning_rate: float | None = None  # Table 4: 0.001 (RAdam)
+    observations: int | None = None  # Table 4: recorded of each action: 1,024
+    batch_observations: int | None = None  # of each action in one update (paper: all)
+    table_observations: int | None = None  # of each action for its representation (paper: all)
+    set_size: int | None = None  # observations that share KL(q(c|X)); None: those of an update
+    q_hidden: int | None = None  # Table 4: width of q(c|X): 128
+    hidden: int | None = None  # Table 4: default width: 64 (published code: pictures, video 128)
+    encoder: Literal["lstm", "mlp"] | None = None  # of trajectories: D.3.1's, or beyond the paper
+    relative: bool | None = None  # states relative to the first one, instead of raw
+    compact: bool | None = None  # Bi-LSTM with half the width per direction, concatenated
+    log_var_lr: float | None = None  # free log-variances: multiple of the learning rate
+    decoder_log_var: float | None = None  # its start; None: from N(0, 1) (published code)
+    workers: int = 0  # processes that record observations, 0: one per core; same result
+    threads: int = 2  # CPU threads of torch; runs repeat bit for bit with the same number
+    plots: bool = True  # draw the t-SNE and reconstruction pictures
 
 
 TABLE_3 = {
@@ -159,12 +128,11 @@ RECIPES = {
         relative=False,
         compact=False,
         log_var_lr=1.0,
-        cosine=False,
     ),
     "laptop": dict(
         encoder="lstm",
         # Raw cells run to 78: the networks would first have to learn to subtract the start to a
-        # tenth of a cell before any skill shows. Displacements show it from the first update.
+        # tenth of a cell before any skill shows. Differences show it from the first update.
         relative=True,
         # Observations of one skill differ in little but the start, so many small updates teach
         # more than few large ones; a single observation would leave nothing to pool over.
@@ -181,17 +149,18 @@ RECIPES = {
         # Two halves of 32, concatenated, are also D.3.1's "64-dimensional encoded vector", at a
         # third of the arithmetic of two averaged 64s.
         compact=True,
-        cosine=False,
         updates=4_000,
     ),
 }
+# ours: the MLP encoder reads the order of the moves sooner than the Bi-LSTM, in half the time.
 RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=2_000)
-# Balls meet a tool in many ways: more observations say more, and are too different to share a c at
-# a thousandth of its price (c would learn them by heart).
-RECIPES["laptop create"] = dict(
-    batch_observations=16, set_size=None, observations=128, updates=2_000
-)
-RECIPES["quick create"] = dict(batch_observations=8, set_size=None, observations=64, updates=1_000)
+
+SPECIAL = {  # recipe and environment or modality -> what else is different there
+    # Balls meet a tool in many ways: more observations say more, but are too different to share a c
+    # at a thousandth of its price (c would learn them by heart).
+    "laptop create": dict(batch_observations=16, set_size=None, observations=128, updates=2_000),
+    "quick create": dict(batch_observations=8, set_size=None, observations=64, updates=1_000),
+}
 
 
 def load_environment(env: str) -> ModuleType:
@@ -224,13 +193,13 @@ def resolve(args: Args) -> Args:
     preset |= VISUAL if KINDS[modality] in ("image", "video") else {}
     preset |= RECIPES[args.recipe]
     for special in (f"{args.recipe} {args.env}", f"{args.recipe} {modality}"):
-        preset |= RECIPES.get(special, {})
+        preset |= SPECIAL.get(special, {})
     if args.epochs and not args.updates:
         preset.pop("updates", None)  # asked for in epochs: the recipe's number steps back
     given = {key: value for key, value in asdict(args).items() if value is not None}
     args = replace(args, **(preset | given | dict(modality=modality)))
-    for name, value in asdict(args).items():
-        if name in COUNTS and value is not None and value < 1:
+    for name in COUNTS:
+        if (value := getattr(args, name)) is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     args.batch_observations = min(args.batch_observations, args.observations)
     args.table_observations = min(args.table_observations, args.observations)
@@ -302,8 +271,8 @@ def prepare(raw: torch.Tensor, fmt: Format) -> tuple[torch.Tensor, torch.Tensor,
     if not fmt.relative:
         return raw, first[:, 0], later
     start = (first - fmt.centre) / fmt.half  # (B, 1, F)
-    moved = (later - first) / fmt.unit  # (B, T, F)
-    return torch.cat([start, moved], 1), start[:, 0], moved
+    steps = raw.diff(dim=1) / fmt.unit  # (B, T, F): read as moves, predicted as places
+    return torch.cat([start, steps], 1), start[:, 0], (later - first) / fmt.unit
 
 
 def undo(output: np.ndarray, first: np.ndarray, fmt: Format) -> np.ndarray:
@@ -745,8 +714,6 @@ def fit(model: ObservationModel, data: np.ndarray, args: Args) -> list[dict]:
     batch = min(args.batch_size, len(data))
     per_epoch = len(data) // batch  # an incomplete last batch is left out
     updates = args.updates or args.epochs * per_epoch
-    scale = (lambda u: 0.5 + 0.5 * np.cos(np.pi * u / updates)) if args.cosine else lambda u: 1.0
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, scale)
     rng, start, rows, totals = np.random.default_rng(args.seed), time.perf_counter(), [], {}
     data = torch.from_numpy(data)
     model.train()
@@ -760,7 +727,6 @@ def fit(model: ObservationModel, data: np.ndarray, args: Args) -> list[dict]:
         parts["loss"].backward()
         nn.utils.clip_grad_value_(model.parameters(), GRADIENT_CLIP)
         optimiser.step()
-        schedule.step()
         totals = {key: totals.get(key, 0.0) + value.detach() for key, value in parts.items()}
         if (update + 1) % 100 == 0 or update + 1 == updates:
             means = {key: float(value) / (update % 100 + 1) for key, value in totals.items()}
