@@ -118,7 +118,7 @@ class Tool(NamedTuple):
 class Kind(NamedTuple):
     """What all tools of one kind share."""
 
-    family: str  # the builder: segment, disc, polygon, box, plank, ball
+    family: str  # how it is built and drawn
     contact: Contact = Contact.PLAIN
     friction: float = 1.0  # the contact law multiplies: tool friction x ball friction (1)
     grey: int = 159  # observation; nominal grey of the published picture
@@ -129,8 +129,7 @@ class Kind(NamedTuple):
 
 ORANGE, BLUE, PLANK_ORANGE = "#fa8535", "#086788", "#fa9149"  # published palette
 KINDS: dict[str, Kind] = {
-    # tools: everything static unless it is a plank. Friction of balls and planks: never set there,
-    # 0.
+    # tools, static unless they are planks; published code never sets the friction of balls, planks
     "No-op": Kind("nothing"),
     "Ramp": Kind("segment", grey=159, colour=ORANGE, radius=1.0),
     "Trampoline": Kind("segment", grey=99, colour="#3d5a98", radius=1.0),
@@ -613,20 +612,15 @@ class Thing:
 
     def __init__(self, tool: Tool, x: float, y: float):
         self.tool, self.kind, self.x, self.y = tool, KINDS[tool.kind], float(x), float(y)
-        self.shape: pymunk.Shape | None = None
-        self.body: pymunk.Body | None = None  # only if it can move
+        self.shape = self.body = None  # pymunk's; a body only if it can move
         self.parts: tuple = ()  # everything to add to the space, bodies first
-        self.corners: list[
-            tuple[float, float]
-        ] = []  # world units; of what is drawn and does not move
-        self.wants: Thing | None = (
-            None  # the ball whose touch this goal, subgoal or marker waits for
-        )
-        self.touched = False  # ... and whether it ever came; never cleared
-        self.holder: Thing | None = None  # the bucket that holds this ball
-        self.first_contact: int | None = None  # probe balls only: physics step of the first contact
+        self.corners: list = []  # world units; of a plank: in its own frame, the weight third
+        self.wants = None  # the ball whose touch this goal, subgoal or marker waits for ...
+        self.touched = False  # ... and whether it came; never cleared
+        self.holder = None  # the bucket that holds this ball
+        self.first_contact = None  # probe balls only: physics step of the first contact
         self.drawn_at, self.stamps = None, []  # cache of the observation's picture
-        self.shown: tuple | None = None  # while a past moment is drawn: where it was then
+        self.shown = None  # while a past moment is drawn: the pose it had then
 
     def pose(self) -> tuple[float, float, float]:
         """x, y (units) and angle (rad), now."""
@@ -932,9 +926,7 @@ def _coverage(shape: str, numbers, xs, ys, scale: float) -> np.ndarray:
     return np.minimum(np.maximum(cover, 0.0, out=cover), 1.0, out=cover)
 
 
-DISC_PHASES = (
-    8  # ours: discs are kept at eighths of a pixel; computing one takes longer than pasting
-)
+DISC_PHASES = 8  # ours: discs are kept at eighths of a pixel; pasting one is faster than computing
 
 
 @lru_cache(maxsize=4096)
@@ -1190,8 +1182,10 @@ class CreateEnv(gymnasium.Env):
         """Check an action completely before anything changes."""
         k = int(self.action_space["choice"].n)
         try:
-            choice = operator.index(action["choice"])
-            x, y = (float(value) for value in action["position"])
+            choice, position = operator.index(action["choice"]), np.asarray(action["position"])
+            if position.shape != (2,) or position.dtype.kind not in "fiu":
+                raise TypeError("position")
+            x, y = position.tolist()
         except (TypeError, ValueError, KeyError, IndexError) as e:
             raise ValueError(
                 "action must be a dict of an integer 'choice' and two numbers 'position', "
@@ -1207,8 +1201,7 @@ class CreateEnv(gymnasium.Env):
         """Put a tool at (x, y) norm if it may stand there."""
         if tool.kind == "No-op":
             return Placement.NO_OP
-        # published code: clips the position first, so its invalid penalty never fires; we test
-        # first
+        # published code: clips the position first, so its invalid penalty never fires; we do not
         if max(abs(x), abs(y)) > 1.0:
             return Placement.OUTSIDE
         # appendix: "overlap over existing objects"; published code: this distance to earlier tools,
@@ -1299,8 +1292,8 @@ class CreateEnv(gymnasium.Env):
             if thing.body is None:
                 key = thing.tool, thing.x, thing.y  # level objects without a shift come again
                 if key not in self._level_stamps:
-                    while len(self._level_stamps) >= 256:
-                        del self._level_stamps[next(iter(self._level_stamps))]
+                    if len(self._level_stamps) >= 256:
+                        self._level_stamps.clear()
                     self._level_stamps[key] = stamps(grey_strokes(thing), 84)
                 paste(self._canvas, self._level_stamps[key])
 
@@ -1391,17 +1384,15 @@ def make_vec(
     """
     if num_envs < 1 or seed < 0:
         raise ValueError(f"num_envs must be 1 or more and seed 0 or more, got {num_envs}, {seed}")
-    CreateEnv(
-        action_pool, num_available, **task_options
-    )  # bad arguments fail here, not in a worker
+    CreateEnv(action_pool, num_available, **task_options)  # fail here, not in a worker
 
     def make(index: int) -> CreateEnv:
         env = CreateEnv(action_pool, num_available, **task_options)
         env.np_random = gymnasium.utils.seeding.np_random(seed + index)[0]
         return env
 
-    if async_envs is None:  # benchmarks/throughput.py: the break-even is between 2 and 4 cores
-        async_envs = len(os.sched_getaffinity(0)) >= 4 and num_envs > 1
+    if async_envs is None:  # ours: see the two N = 32 rows of benchmarks/throughput.py
+        async_envs = (os.cpu_count() or 1) >= 4 and num_envs > 1
     thunks = [partial(make, index) for index in range(num_envs)]
     vector = AsyncVectorEnv if async_envs else SyncVectorEnv
     return vector(thunks, autoreset_mode=AutoresetMode.SAME_STEP)
@@ -1500,17 +1491,9 @@ def _cached_states(ids, n: int, seed: int, workers: int, cache) -> np.ndarray:
     known: dict[int, np.ndarray] = {}
     path = None
     if cache is not None:
-        constants = (
-            TOOLS,
-            KINDS,
-            GRAVITY,
-            DT,
-            SLEEP_TIME,
-            PROBE_ATTEMPTS,
-            PROBE_STEPS,
-            PROBE_EVERY,
-        )
-        constants += (PROBE_LENGTH, PROBE_SPEED, PROBE_AREA, PROBE_BALL, NO_OP_REACH, CELL, MUZZLE)
+        constants = (TOOLS, KINDS, GRAVITY, DT, SLEEP_TIME, PLANK_MASS, PLANK_MOMENT, BOX_SIZE)
+        constants += (PROBE_ATTEMPTS, PROBE_STEPS, PROBE_EVERY, PROBE_LENGTH, PROBE_SPEED)
+        constants += (PROBE_AREA, PROBE_BALL, NO_OP_REACH, CELL, MUZZLE)
         fingerprint = repr((constants, pymunk.version, pymunk.chipmunk_version, n, seed))
         digest = hashlib.sha256(fingerprint.encode()).hexdigest()[:16]
         path = Path(cache) / f"create-probe-n{n}-s{seed}-{digest}.npz"
@@ -1997,7 +1980,7 @@ def tools_sheet(size: int = 300) -> Image.Image:
         spots = [(x, y) for y in (58, 26) for x in (26, 58)]
         for spot, share in zip(spots, (0.98, 0.12, 0.45, 0.7), strict=True):
             draw_thing(pen, build(TOOLS[ids[int(share * len(ids))]], *spot, static_body))
-        edge = size // 8  # cut the margin off
+        edge = size // 10  # cut the margin off
         tiles.append(pen.picture()[edge : size - edge, edge : size - edge])
         titles.append(f"{label} ({len(ids)})")
     return sheet(tiles, titles, 5)
