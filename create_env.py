@@ -1462,9 +1462,7 @@ def action_observations(
     if modality == "state":
         return np.ascontiguousarray(states[..., :6])
     jobs = list(zip(ids.tolist(), states, strict=True))
-    videos = np.empty(
-        (len(ids), num_observations, PROBE_LENGTH, PROBE_VIDEO, PROBE_VIDEO), np.uint8
-    )
+    videos = np.empty((*states.shape[:3], PROBE_VIDEO, PROBE_VIDEO), np.uint8)
     for row, video in enumerate(_spread(_probe_video, jobs, workers, "probe videos")):
         videos[row] = video
     return videos
@@ -1529,17 +1527,14 @@ def _probe_states(job: tuple[int, int, int]) -> np.ndarray:
         start = rng.uniform(-1.0, 1.0, (len(waiting), 2))
         gap = places[waiting] - start
         distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (waiting, 1) norm
-        speed = (
-            rng.uniform(0.6, 1.4, (len(waiting), 1)) * PROBE_SPEED * speed_factor * (1 + distance)
-        )
+        speed = PROBE_SPEED * speed_factor * (1 + distance)  # (waiting, 1) units/s
+        speed *= rng.uniform(0.6, 1.4, (len(waiting), 1))
         velocity = speed * gap / np.maximum(distance, 1e-9)
         states, contact = _launch(tool, places[waiting], start, velocity)
         # contact: physics step 1..90 of the first touch, 0 overlap at launch, 91 never
         last = attempt >= PROBE_ATTEMPTS - 1  # then a miss is kept, an overlap draws again
         done = (contact > 0) & ((contact <= PROBE_STEPS) | last)
-        first = (
-            -(-contact[done] // PROBE_EVERY) - 1
-        )  # index of the first state at or after the touch
+        first = (contact[done] - 1) // PROBE_EVERY  # the first state at or after the touch
         cut = np.where(contact[done] > PROBE_STEPS, 1, np.clip(first - 3, 0, 2))
         frames = cut[:, None] + np.arange(PROBE_LENGTH)  # (done, 7)
         result[waiting[done]] = states[done][np.arange(done.sum())[:, None], frames]
