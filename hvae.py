@@ -149,11 +149,11 @@ RECIPES = {
         # Two halves of 32, concatenated, are also D.3.1's "64-dimensional encoded vector", at a
         # third of the arithmetic of two averaged 64s.
         compact=True,
-        updates=4_000,
+        updates=2_500,
     ),
 }
 # ours: the MLP encoder reads the order of the moves sooner than the Bi-LSTM, in half the time.
-RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=2_000)
+RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=1_500)
 
 SPECIAL = {  # recipe and environment or modality -> what else is different there
     # Balls meet a tool in many ways: more observations say more, but are too different to share a c
