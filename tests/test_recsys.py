@@ -269,7 +269,13 @@ def script_steps(scripts, gone, organic, log):
     [{}, {"unit_norm_state": True, "leave_at_reset": False}, {"no_repeat_reward": True}],
     ids=str,
 )
-def test_vector_env_equals_scalar_env_on_shared_random_numbers(num_available, options):
+@pytest.mark.parametrize("rare_events", [False, True])
+def test_vector_env_equals_scalar_env_on_shared_random_numbers(
+    monkeypatch, num_available, options, rare_events
+):
+    if rare_events:  # make leaving unnoticed, coming back, and the time limit frequent
+        monkeypatch.setattr(recsys, "SESSION_LEAVE", 0.5)
+        monkeypatch.setattr(recsys, "MAX_RECOMMENDATIONS", 4)
     n, rng = 6, np.random.default_rng(3)
     envs = make_vec(n, SMALL, num_available, 5, **options)
     recorder = envs._np_random = Recorder(envs._np_random)
@@ -290,8 +296,11 @@ def test_vector_env_equals_scalar_env_on_shared_random_numbers(num_available, op
     for i, scalar in enumerate(scalars):
         compare(scalar.reset()[0], observation, i)
     ended = clicked = timed_out = unnoticed = 0
-    for _ in range(1200):
-        actions, gone = rng.integers(num_available, size=n), envs._gone.copy()
+    for _ in range(200 if rare_events else 1000):
+        actions, gone = (
+            rng.integers(num_available, size=n),
+            np.array([e.mode for e in scalars]) == GONE,
+        )
         users, ids = envs.users.copy(), envs.available[np.arange(n), actions]
         observation, rewards, terminated, truncated, infos = envs.step(actions)
         over = terminated | truncated
@@ -317,7 +326,7 @@ def test_vector_env_equals_scalar_env_on_shared_random_numbers(num_available, op
             assert infos == {}
         ended, clicked = ended + over.sum(), clicked + click.sum()
         timed_out, unnoticed = timed_out + truncated.sum(), unnoticed + gone.sum()
-    assert ended > 100 and clicked > 500 and timed_out > 10  # every rule was at work
+    assert ended > 80 and clicked > 100 and timed_out > 10  # every rule was at work
     assert (unnoticed > 0) == options.get("leave_at_reset", True)
 
 
