@@ -68,6 +68,7 @@ def table(env: str) -> str:
     """A Markdown table: per method ours (mean and std over seeds) beside the published numbers."""
     ours, theirs = scores(env), published(env)
     ceiling = ppo_actiongen.CEILINGS.get(env)
+    phases = "" if not ceiling or ceiling[0] == ceiling[1] else " (seen: {0})"
     lines = [
         "| method | seen: ours | seen: published | **unseen: ours** | unseen: published "
         "| seeds | steps | hours |",
@@ -85,7 +86,7 @@ def table(env: str) -> str:
         hours = mean(float(r["hours"]) for r in rows)
         cells += [str(len(rows)), f"{int(rows[0]['steps']) / 1e6:.1f}M", f"{hours:.2f}"]
         lines.append("| " + " | ".join(cells) + " |")
-    note = f"Ceiling: {ceiling}. " if ceiling is not None else ""
+    note = f"Ceiling: {ceiling[1]}{phases.format(*ceiling)}. " if ceiling else ""
     lines.append(
         f"\n{note}± is the standard deviation over seeds; hours are per seed on one CPU core. "
         f"Command: `python benchmarks/paper.py {env}`; every row's own command is in "
@@ -115,7 +116,8 @@ def bar_figure(env: str, path: Path) -> None:
                 m, s, _ = theirs[method, phase]
                 axis.bar(x + 0.2, m, 0.38, yerr=s, fill=False, edgecolor=f"C{x}", capsize=2)
         if env in ppo_actiongen.CEILINGS:
-            axis.axhline(ppo_actiongen.CEILINGS[env], color="grey", lw=1)
+            ceiling = ppo_actiongen.CEILINGS[env][phase == "test"]
+            axis.axhline(ceiling, color="grey", lw=1)
         axis.set_xticks(range(len(methods)), [METHODS[m] for m in methods], rotation=35, ha="right")
         axis.set_title(title)
         axis.spines[["top", "right"]].set_visible(False)
