@@ -372,14 +372,14 @@ def mean_height(policy, episodes, **options):
 
 
 @needs_physics
-def test_random_play_and_a_flat_tower_reach_the_published_heights():
+def test_random_play_and_a_flat_tower_reach_the_expected_heights():
     assert 1.2 < mean_height("random", 16) < 2.1  # 1.63; standard error .12
     assert 4.2 < mean_height("greedy", 10) < 6.6  # 5.39; standard error .4
 
 
 @needs_physics
 @pytest.mark.slow
-def test_mean_heights_are_the_fact_sheets_within_their_error():
+def test_mean_heights_are_those_measured_before_within_their_error():
     parts = stacking_env.split_actions()
     unseen = np.concatenate([parts["valid"], parts["test"]])
     assert abs(mean_height("random", 200) - 1.63) < 0.2
