@@ -137,17 +137,17 @@ RECIPES = {
         # Observations of one skill differ in little but the start, so many small updates teach
         # more than few large ones; a single observation would leave nothing to pool over.
         batch_observations=4,
-        # The paper shows all 1,024 observations in every update: one bears 1/1,024 of the price of
-        # c. With 1/4 instead, most of c falls silent and skills differ in 4 dimensions of 16.
-        set_size=1024,
-        # Pooling over 64 of 1,024 observations hardly moves a representation.
+        # A representation is pooled over a set of 64 observations: enough to average out starts.
         table_observations=64,
+        # Each update sees 4 of that set, so each bears 1/64 of the price of c, as in the ELBO of
+        # the whole set. At 1/4, c kept only 4 of its 16 dimensions in use.
+        set_size=64,
         # A free log-variance moves by about lr per update: 10,000 updates from its start to -9.
         log_var_lr=10.0,
         # ... and starts where one move of one cell is already 2.7 sigma.
         decoder_log_var=-2.0,
-        # Two halves of 32, concatenated, are also D.3.1's "64-dimensional encoded vector", at a
-        # third of the arithmetic of two averaged 64s.
+        # Two halves of 32, concatenated, are also D.3.1's "64-dimensional encoded vector", with a
+        # quarter of the weights of two averaged 64s.
         compact=True,
         updates=2_500,
     ),
@@ -156,8 +156,8 @@ RECIPES = {
 RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=1_500)
 
 SPECIAL = {  # recipe and environment or modality -> what else is different there
-    # Balls meet a tool in many ways: more observations say more, but are too different to share a c
-    # at a thousandth of its price (c would learn them by heart).
+    # Balls meet a tool in many ways: more observations say more, but c must not be so cheap that it
+    # learns the few of an update by heart.
     "laptop create": dict(batch_observations=16, set_size=None, observations=128, updates=2_000),
     "quick create": dict(batch_observations=8, set_size=None, observations=64, updates=1_000),
 }
@@ -1041,7 +1041,7 @@ def plot_reconstructions(model, raw: np.ndarray, titles: list[str], path: Path) 
     fmt, device = model.format, next(model.parameters()).device
     model.eval()
     output = model.reconstruct(torch.from_numpy(np.ascontiguousarray(raw)).to(device)).cpu().numpy()
-    figure = Figure(figsize=(14, 4.2), layout="constrained")
+    figure = Figure(figsize=(14, 3.8), layout="constrained")
     rows = figure.subplots(2, len(raw))
     for true, made, column, title in zip(raw, output, rows.T, titles, strict=True):
         first = true[:, 0].astype(float)  # (n, F), or a picture or frame that `undo` ignores

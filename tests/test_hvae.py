@@ -328,6 +328,36 @@ def test_tables_3_and_4():
     assert hvae.TABLE_3["stacking"] == dict(representation_size=128, batch_size=32, epochs=5_000)
 
 
+@pytest.mark.parametrize("hierarchical", [True, False])
+@pytest.mark.parametrize(
+    "env, modality, size",
+    [
+        ("gridworld", "onehot", 16),
+        ("create", "xy", 128),
+        ("create", "state", 128),
+        ("create", "video", 128),
+        ("stacking", "image", 128),
+    ],
+)
+def test_every_modality_trains_and_is_drawn(tmp_path, env, modality, size, hierarchical):
+    """Real observations of four actions: one update, reconstructions in raw units, a picture."""
+    module = hvae.load_environment(env)
+    args = hvae.resolve(Args(env=env, modality=modality, updates=1, batch_observations=2))
+    raw = module.action_observations(np.arange(4), 2, modality, seed=0, workers=1)
+    fmt = Format.of(env, modality, raw.shape, args.relative)
+    model = (HVAE if hierarchical else VAE)(fmt, args)
+    rows = hvae.fit(model, raw, args)
+    assert len(rows) == 1 and np.isfinite(list(rows[0].values())).all()
+    model.eval()
+    with torch.no_grad():
+        assert model.represent(torch.from_numpy(raw))[0].shape == (4, size)
+        output = model.reconstruct(torch.from_numpy(raw)).numpy()
+    states = hvae.undo(output[0], raw[0, :, 0].astype(float), fmt)
+    assert states.shape == (raw[0, :, None] if modality == "image" else raw[0, :, 1:]).shape
+    hvae.plot_reconstructions(model, raw, ["a"] * 4, tmp_path / "x.png")
+    assert (tmp_path / "x.png").stat().st_size > 5_000
+
+
 # ---- probe ----
 
 
@@ -341,6 +371,19 @@ def test_probe_of_ground_truth_and_of_noise():
     moves = gridworld.SKILL_MOVES
     net = gridworld.MOVE_DELTAS[moves].sum(1).astype(float)
     assert hvae.probe(net, TRAIN, HELD_OUT)["nn_net_match"] > 0.98
+
+
+def test_probe_of_other_environments():
+    module = hvae.load_environment("stacking")
+    split, truth = module.split_actions(), module.engineered_representations()
+    held_out = np.concatenate([split["valid"], split["test"]])
+    scores = hvae.probe(truth, split["train"], held_out, "stacking")
+    assert (
+        scores["engineered_r2"] > 0.99 and scores["nn_class"] > 0.9 > 0.2 > scores["chance_class"]
+    )
+    noise = np.random.default_rng(0).normal(size=(810, 128))
+    scores = hvae.probe(noise, split["train"], held_out, "stacking")
+    assert scores["engineered_r2"] < 0.1 and abs(scores["nn_class"] - scores["chance_class"]) < 0.06
 
 
 # ---- the file of representations ----
