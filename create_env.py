@@ -4,7 +4,7 @@ A two-dimensional physics puzzle. Balls fall; every 40 physics steps the agent p
 tools on offer and a place to put it, so that the red target ball reaches the green goal. Twelve
 tasks, 2,111 tools (and 6,248 more for the Full split and the analyses).
 
-    python create_env.py --task push            # the best of 400 random episodes as a GIF (10 s)
+    python create_env.py --task push            # the best of 400 random episodes as a GIF (5 s)
     python create_env.py --all-tasks            # Figure 7: the 12 tasks on one sheet
     python create_env.py --show-tools           # one tool of each class
     python create_env.py --show-probe Cannon    # probe-ball trajectories over a tool (class or id)
