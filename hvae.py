@@ -121,7 +121,7 @@ VISUAL = dict(batch_size=32, epochs=5_000, hidden=128)  # published code, for CR
 # Every way in which the short recipes leave the paper. Each line stands alone: what it is worth can
 # be seen by switching it back on the command line.
 RECIPES = {
-    "paper": dict(
+    "paper": dict(  # 128 x 1,024 trajectories in one update take 11 GB of memory
         batch_observations=1024,
         table_observations=1024,
         encoder="lstm",
@@ -160,6 +160,11 @@ SPECIAL = {  # recipe and environment or modality -> what else is different ther
     # learns the few of an update by heart.
     "laptop create": dict(batch_observations=16, set_size=None, observations=128, updates=2_000),
     "quick create": dict(batch_observations=8, set_size=None, observations=64, updates=1_000),
+    # Pictures cost a hundred times as much as grid trajectories.
+    "laptop image": dict(observations=64, updates=1_000),
+    "quick image": dict(observations=32, batch_observations=2, updates=200),
+    "laptop video": dict(observations=32, batch_observations=4, updates=1_000),
+    "quick video": dict(observations=16, batch_observations=2, updates=200),
 }
 
 
