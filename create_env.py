@@ -1919,11 +1919,19 @@ def draw_caption(pen: Pen, left: str, right: str, colour: str) -> None:
 # ---- demo ----
 
 
-def save_gif(frames: Sequence[np.ndarray], path: Path, fps: int = 15) -> None:
-    """Write RGB frames as a looping GIF that stays on the last frame for a second and a half."""
+def save_gif(path: str | Path, frames: list[np.ndarray], fps: float) -> None:
+    """Write pictures as an endless GIF; the last one stays for 1.5 s. Creates missing folders."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    durations = [round(1000 / fps)] * (len(frames) - 1) + [1500]  # ours: time to see the outcome
+    # 128 colours without dithering: half the size, and flat areas stay flat
     images = [Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE) for frame in frames]
-    durations = [1000 // fps] * (len(images) - 1) + [1500]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
+    temporary = path.with_name(path.name + ".part")  # a reader never meets a half-written file
+    with open(temporary, "wb") as file:
+        images[0].save(
+            file, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0
+        )
+    os.replace(temporary, path)
 
 
 def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, int]:
@@ -2053,7 +2061,7 @@ def main(args: Args) -> None:
         env = CreateEnv(task=args.task, render_mode="rgb_array")
         frames, total, length = play_episode(env, best)
         path = args.out / f"create_{args.task}.gif"
-        save_gif(frames, path)
+        save_gif(path, frames, env.metadata["render_fps"])
     except (ValueError, FileNotFoundError) as e:
         raise SystemExit(f"error: {e}") from e
     print(

@@ -15,6 +15,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 import create_env as c
 from create_env import CreateEnv, Placement, Tool
@@ -971,6 +972,19 @@ def test_bad_splits():
 
 
 # ---- the command ----
+
+
+def test_gif_shows_every_frame(tmp_path):
+    env = CreateEnv(render_mode="rgb_array", render_size=84)
+    env.reset(seed=0)
+    frames = env.render_frames()
+    env.step(NO_OP)
+    frames += env.render_frames()
+    c.save_gif(tmp_path / "new" / "episode.gif", frames, 10)
+    (path,) = (tmp_path / "new").iterdir()
+    with Image.open(path) as gif:
+        assert gif.n_frames == len(frames) == 1 + c.FRAMES_PER_ACTION
+        assert gif.size == (84, 90) and gif.info["duration"] == 100
 
 
 def run_command(*arguments: str) -> subprocess.CompletedProcess:
