@@ -156,10 +156,9 @@ RECIPES = {
 RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=1_500)
 
 SPECIAL = {  # recipe and environment or modality -> what else is different there
-    # Balls meet a tool in many ways: more observations say more, but c must not be so cheap that it
-    # learns the few of an update by heart.
-    "laptop create": dict(batch_observations=16, set_size=None, observations=128, updates=2_000),
-    "quick create": dict(batch_observations=8, set_size=None, observations=64, updates=1_000),
+    # Balls meet a tool in many ways: more observations in an update say more about it.
+    "laptop create": dict(batch_observations=16, observations=128, updates=2_000),
+    "quick create": dict(batch_observations=8, observations=64, updates=1_000),
     # Pictures cost a hundred times as much as grid trajectories.
     "laptop image": dict(observations=64, updates=1_000),
     "quick image": dict(observations=32, batch_observations=2, updates=200),
