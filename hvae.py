@@ -149,7 +149,7 @@ RECIPES = {
         # Two halves of 32, concatenated, are also D.3.1's "64-dimensional encoded vector", with a
         # quarter of the weights of two averaged 64s.
         compact=True,
-        updates=2_500,
+        updates=2_750,
     ),
 }
 # ours: the MLP encoder reads the order of the moves sooner than the Bi-LSTM, in half the time.
