@@ -1391,7 +1391,9 @@ def make_vec(
         env.np_random = gymnasium.utils.seeding.np_random(seed + index)[0]
         return env
 
-    if async_envs is None:  # ours: see the two N = 32 rows of benchmarks/throughput.py
+    # ours: processes cost 2.5 times the processor time (benchmarks/throughput.py, N = 32), so they
+    # pay from about three cores on.
+    if async_envs is None:
         async_envs = (os.cpu_count() or 1) >= 4 and num_envs > 1
     thunks = [partial(make, index) for index in range(num_envs)]
     vector = AsyncVectorEnv if async_envs else SyncVectorEnv
