@@ -222,7 +222,7 @@ UNITS = {
     # cells 1..78; one move = 7 sigma
     "gridworld": dict(centre=39.5, half=39.5, unit=1.0, y_down=True),
     # ours: 4 of 84 pixels, so that sigma can fall to half a pixel
-    "create": dict(centre=0.0, half=1.0, unit=4 / 42),
+    "create": dict(centre=0.0, half=1.0, unit=4 / 42),  # 42 pixels are 1
 }
 
 
@@ -237,7 +237,7 @@ class Format:
     centre: float = 0.0
     half: float = 1.0
     unit: float = 1.0
-    y_down: bool = False  # for pictures only
+    y_down: bool = False  # only for `plot_reconstructions`
 
     @property
     def visual(self) -> bool:
@@ -774,7 +774,12 @@ def train(args: Args) -> Path:
     split = module.split_actions(args.split, args.split_seed)
     pool = np.unique(np.concatenate(list(split.values())))
     ids = pool if args.train_on == "all" else split["train"]
-    cuda = args.device == "cuda" or (args.device == "auto" and torch.cuda.is_available())
+    cuda = torch.cuda.is_available()
+    device = ("cuda" if cuda else "cpu") if args.device == "auto" else args.device
+    if device != "cpu" and not (cuda and device.startswith("cuda")):
+        raise ValueError(
+            f"device {device!r} is not available; allowed: auto, cpu, cuda (with a GPU)"
+        )
     threads = torch.get_num_threads()
     torch.set_num_threads(args.threads)
     try:
@@ -782,7 +787,7 @@ def train(args: Args) -> Path:
             torch.manual_seed(args.seed)
             data = observe(module, ids, args.observations, args)  # training actions only
             fmt = Format.of(args.env, args.modality, data.shape, args.relative)
-            model = (HVAE if args.hierarchical else VAE)(fmt, args).to("cuda" if cuda else "cpu")
+            model = (HVAE if args.hierarchical else VAE)(fmt, args).to(device)
             rows = fit(model, data, args)
         mean, log_var = embed(model, module, pool, args)
     finally:

@@ -308,6 +308,7 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
     (dict(recipe="slow"), "unknown recipe 'slow' for gridworld"),
     (dict(train_on="test"), "unknown train_on 'test'"),
     (dict(encoder="cnn"), "unknown encoder 'cnn'"),
+    (dict(device="tpu"), "device 'tpu' is not available; allowed: auto, cpu"),
     (dict(split="odd"), "odd"),
     (dict(updates=0), "updates must be at least 1, got 0"),
     (dict(batch_size=-1), "batch_size must be at least 1, got -1"),
