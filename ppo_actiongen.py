@@ -262,7 +262,6 @@ CEILINGS = {
     # seen in training, not for new ones; fully observable it is part of the representation.
     "recsys": (0.664, 0.297),
     "recsys-full": (0.664, 0.664),
-    "stacking": (5.4, 5.4),  # a greedy flat tower: a good plan, not a bound
 }
 
 
@@ -1066,7 +1065,7 @@ def record_episode(agent, preprocess, args: Args, pool, path: Path) -> None:
         if total > best[0]:
             best = (total, frames)
     env.close()
-    module.save_gif(path, best[1], fps=6)
+    module.save_gif(path, best[1], fps=env.metadata["render_fps"])
 
 
 def print_table(results: dict, metric: str) -> None:
