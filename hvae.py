@@ -267,11 +267,12 @@ def prepare(raw: torch.Tensor, fmt: Format) -> tuple[torch.Tensor, torch.Tensor,
         return frames[:, None], frames[:, None], frames[:, None]
     first, later = raw[:, :1], raw[:, 1:]
     if fmt.kind == "onehot":
-        # Relative for classes: a later state in the start column is class 40, one to its right 41.
-        shift = CLASSES // 2 - first if fmt.relative else 0
-        classes = torch.cat([first, later + shift], 1).long()  # (B, L, 2)
-        inputs = F.one_hot(classes, CLASSES).flatten(2).float()  # (B, L, 160)
-        return inputs, inputs[:, 0], classes[:, 1:]
+        seen, target = raw, later
+        if fmt.relative:  # class 40 is "no change", 41 one cell to the right or down
+            seen = torch.cat([first, raw.diff(dim=1) + CLASSES // 2], 1)
+            target = later - first + CLASSES // 2
+        inputs = F.one_hot(seen.long(), CLASSES).flatten(2).float()  # (B, L, 160)
+        return inputs, inputs[:, 0], target.long()
     if not fmt.relative:
         return raw, first[:, 0], later
     start = (first - fmt.centre) / fmt.half  # (B, 1, F)
