@@ -107,10 +107,10 @@ def test_loss_equals_the_elbo_written_observation_by_observation(kind, monkeypat
                 else:
                     sigma = (model.log_var.clamp(-4, 3) / 2).exp()
                     rec += Normal(output, sigma).log_prob(targets[j : j + 1]).sum()
-    # 6 observations; c is shared by the 1,024 observations of an action (Table 4)
+    # 6 observations; one c is shared by the set of 64 behind a representation
     torch.testing.assert_close(parts["rec"], rec / 6)
     torch.testing.assert_close(parts["kl_z"], kl_z / 6)
-    torch.testing.assert_close(parts["kl_c"], kl_c / 3 / 1024)
+    torch.testing.assert_close(parts["kl_c"], kl_c / 3 / 64)
     torch.testing.assert_close(parts["loss"], parts["kl_z"] + parts["kl_c"] - parts["rec"])
 
 
@@ -272,7 +272,7 @@ def test_short_training_learns_unseen_skills_and_never_sees_them(tmp_path, monke
     model = HVAE(Format.of("gridworld", "xy", (6, 2), True), arguments(encoder="mlp"))
     model.load_state_dict(weights)
     model.eval()
-    raw = torch.from_numpy(gridworld.action_observations([5], 1024, "xy")[:, :64].copy())
+    raw = torch.from_numpy(gridworld.action_observations([5], 64, "xy"))
     with torch.no_grad():
         mean = model.represent(raw)[0][0]
     np.testing.assert_allclose(mean, table["mean"][5], atol=1e-4)
@@ -535,5 +535,5 @@ def test_recipe_equals_the_published_table(tmp_path, recipe, seed):
     args = Args(recipe=recipe, seed=seed, runs_dir=str(tmp_path), plots=False)
     path = hvae.train(args)
     scores = json.loads(path.with_suffix(".json").read_text())["scores"]
-    assert scores["net_r2"] >= 0.94 and scores["move_accuracy"] >= 0.59
-    assert scores["nn_net_match"] >= 0.68
+    assert scores["net_r2"] >= 0.946 and scores["move_accuracy"] >= 0.6
+    assert scores["nn_net_match"] >= 0.7
