@@ -29,6 +29,7 @@ METHODS = {
     "ours_no_subsampling": "w/o subsampling",
     "nearest_neighbor": "Nearest neighbour",
     "continuous_output": "Continuous output",
+    "ours_mlp_encoder": "Ours, MLP encoder",
 }
 TITLES = {
     "gridworld": "Grid World, success rate",

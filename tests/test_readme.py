@@ -42,4 +42,4 @@ def test_every_command_line_flag_it_names_is_known():
     known |= {f.name.replace("_", "-") for f in ppo_actiongen.fields(ppo_actiongen.EvaluateArgs)}
     for line in re.findall(r"`(?:python ppo_actiongen\.py|--)[^`]*`", TEXT):
         for flag in re.findall(r"--(?:no-)?([\w-]+)", line):
-            assert flag in known | {"subsample"}, flag
+            assert flag in known | {"dry-run", "jobs"}, flag
