@@ -106,7 +106,7 @@ class Args:
     log_var_lr: float | None = None  # free log-variances: multiple of the learning rate
     decoder_log_var: float | None = None  # its start; None: from N(0, 1) (published code)
     workers: int = 0  # processes that record observations, 0: one per core; same result
-    threads: int = 2  # CPU threads of torch; runs repeat bit for bit with the same number
+    threads: int = 1  # CPU threads of torch; a second one waits more than it works
     plots: bool = True  # draw the t-SNE and reconstruction pictures
 
 
@@ -159,6 +159,9 @@ SPECIAL = {  # recipe and environment or modality -> what else is different ther
     # Balls meet a tool in many ways: more observations in an update say more about it.
     "laptop create": dict(batch_observations=16, observations=128, updates=2_000),
     "quick create": dict(batch_observations=8, observations=64, updates=1_000),
+    # 160 zeros and ones per state say the same as 2 numbers, and are learned later.
+    "laptop onehot": dict(updates=4_000),
+    "quick onehot": dict(updates=2_500),
     # Pictures cost a hundred times as much as grid trajectories.
     "laptop image": dict(observations=64, updates=1_000),
     "quick image": dict(observations=32, batch_observations=2, updates=200),

@@ -439,7 +439,8 @@ class Agent(nn.Module):
     """State encoder, critic, utility (or a baseline's head) and auxiliary heads.
 
     `table` (A, D) holds one fixed representation per action of the whole action set; it is never
-    trained by RL. `train_ids` gives the nearest-neighbour baseline's outputs their meaning.
+    trained by RL. `train_ids` (n,) is the pool trained on; it also says what the outputs of the
+    nearest-neighbour baseline mean.
     """
 
     def __init__(self, state_space, action_space, table, train_ids, args: Args, workers: Workers):
@@ -477,17 +478,19 @@ class Agent(nn.Module):
         code, critic_code = self.encoder(state)
         return code, self.critic(critic_code)[:, 0]
 
-    def project_actions(self):
-        """P (A, H): the action half of the utility's hidden layer, for every action there is.
+    def project_actions(self, ids=None):
+        """P (A, W): the action half of the utility's hidden layer, for every action there is.
 
         Depends on the parameters only: once per rollout when acting, once per minibatch when
-        learning. D.3.2: c -> linear -> concatenate -> 2-layer MLP; no non-linearity in between.
+        learning, and then only for the rows `ids` (n,) that the pool can offer, (n, W).
+        D.3.2: c -> linear -> concatenate -> 2-layer MLP; no non-linearity in between.
         """
         if self.method != "utility":
             return None
+        table = self.table if ids is None else self.table[ids]
         H = self.action_project.out_features
         W_c = self.utility_hidden.weight[:, H:]  # (W, H): the columns that see the action
-        return self.action_project(self.table) @ W_c.T + self.utility_hidden.bias  # (A, W)
+        return self.action_project(table) @ W_c.T + self.utility_hidden.bias  # (A, W)
 
     def choice_logits(self, code, available, P):
         """Logits over the K actions on offer, (B, K) [nearest neighbour: training actions]."""
@@ -848,8 +851,12 @@ def ppo_loss(agent, mb, P, ent_coef: float, args: Args):
 
 def update(agent, optimizer, batch, ent_coef, args: Args, generator, device):
     """PPO's epochs over one rollout; returns the mean of each loss part over all minibatches."""
+    ids = agent.train_ids  # (n,): only these were on offer, so only their rows are projected
+    row = torch.zeros(len(agent.table), dtype=torch.int64, device=device)
+    row[ids] = torch.arange(len(ids), device=device)
     skip = ("raw", "reward", "done", "choice" if args.method != "utility" else "")
     b = {k: v.flatten(0, 1).to(device) for k, v in batch.items() if k not in skip}  # (T*N, ...)
+    b["available"] = row[b["available"]]  # (T*N, K): global ids -> rows of project_actions(ids)
     # Normalised once over the whole rollout: every epoch sees the same values (published code).
     adv = b["advantage"]
     b["advantage"] = (adv - adv.mean()) / (adv.std() + 1e-5)
@@ -860,8 +867,8 @@ def update(agent, optimizer, batch, ent_coef, args: Args, generator, device):
         for start in range(0, size * args.num_minibatches, size):  # a rest is dropped
             mb_inds = permutation[start : start + size]
             mb = {k: v[mb_inds] for k, v in b.items()}
-            # The parameters changed, so the whole table is projected again: (A, H), cheap.
-            loss, parts = ppo_loss(agent, mb, agent.project_actions(), ent_coef, args)
+            # The parameters changed, so the table is projected again: (n, W), cheap.
+            loss, parts = ppo_loss(agent, mb, agent.project_actions(ids), ent_coef, args)
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
