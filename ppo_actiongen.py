@@ -374,6 +374,7 @@ class FactorisedUtility(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, u, P, w, available, workers):
+        """u (B, W), P (A, W), w (W,), available (B, K) -> logits (B, K)."""
         ctx.save_for_backward(u, P, w, available)
         ctx.workers = workers
         logits = u.new_empty(available.shape)  # (B, K)
@@ -386,6 +387,7 @@ class FactorisedUtility(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
+        """Gradient of the logits (B, K) -> gradients of u, P and w."""
         u, P, w, available = ctx.saved_tensors
         grad_u = torch.empty_like(u)
         H = u.shape[1]
