@@ -697,7 +697,6 @@ def load_table(args: Args, train_ids: np.ndarray) -> np.ndarray:
                 recipe=args.hvae_recipe,
                 device=args.device,
                 runs_dir=args.runs_dir,
-                threads=args.threads,
             )
             path = hvae.representation_path(hvae_args)
             if not path.exists():
