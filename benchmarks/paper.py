@@ -36,7 +36,7 @@ EXPERIMENTS: dict[str, dict[str, str]] = {
         "non_hierarchical_vae": "gridworld --representation vae",
         "ours_no_entropy": "gridworld --ent-coef 0",
         # Ten times the cost per step of the others, so a narrower utility and fewer steps.
-        "ours_no_subsampling": "gridworld --no-subsample --utility-hidden 64 --budget 0.4",
+        "ours_no_subsampling": "gridworld --no-subsample --utility-hidden 64 --budget 0.2",
         "nearest_neighbor": "gridworld --method nearest-neighbor",
         "continuous_output": "gridworld --method continuous",
         "ours_mlp_encoder": "gridworld --hvae-recipe quick",  # beyond the paper

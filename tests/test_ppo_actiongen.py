@@ -89,8 +89,9 @@ def test_utility_pieces_and_workers_do_not_change_the_result():
         torch.testing.assert_close(logits, torch.relu(u[:, None] + P[sets]) @ w)
 
 
-def test_policy_is_equivariant_to_the_order_of_the_available_actions():
-    agent, _ = make_agent()
+@pytest.mark.parametrize("form", ["mlp", "bilinear"])
+def test_policy_is_equivariant_to_the_order_of_the_available_actions(form):
+    agent, _ = make_agent(utility=form)
     code, sets = torch.randn(9, 64), random_sets(9)
     P = agent.project_actions()
     order = torch.randperm(5)
@@ -98,6 +99,16 @@ def test_policy_is_equivariant_to_the_order_of_the_available_actions():
         a = agent.choice_logits(code, sets, P)[:, order]
         b = agent.choice_logits(code, sets[:, order], P)
     torch.testing.assert_close(a, b)
+
+
+def test_bilinear_utility_is_a_product_of_code_and_representation():
+    agent, _ = make_agent(utility="bilinear")
+    code, sets = torch.randn(9, 64), random_sets(9)
+    logits = agent.choice_logits(code, sets, agent.project_actions())
+    for b in range(9):
+        for k in range(5):
+            expected = code[b] @ agent.utility_query.weight.T @ agent.table[sets[b, k]]
+            torch.testing.assert_close(logits[b, k], expected)
 
 
 def test_initial_policy_of_the_paper_is_uniform():
