@@ -974,6 +974,8 @@ def method_name(args: Args) -> str:
     modality_is_default = args.modality is None or (
         args.modality == importlib.import_module(MODULES[args.env]).MODALITIES[0]
     )
+    if args.utility == "bilinear":
+        return "ours_bilinear"  # beyond the paper
     return "ours" if modality_is_default else "ours_alternate_modality"
 
 
@@ -987,11 +989,11 @@ def published_scores(args: Args) -> dict[str, float]:
     """Published mean per phase of this method, {} where there is none."""
     path = Path(__file__).parent / "results" / "published_results.csv"
     env = args.env + ("_full" if args.fully_observable else "")
-    scores = {}
+    scores, method = {}, method_name(args).removesuffix("_bilinear")
     if path.exists():
         for row in csv.DictReader(path.open()):
             same_task = (row["task"] or None) in (args.task, None)
-            if row["env"] == env and same_task and row["method"] == method_name(args):
+            if row["env"] == env and same_task and row["method"] == method:
                 scores[row["phase"]] = float(row["mean"])
     return scores
 

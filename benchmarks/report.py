@@ -30,6 +30,7 @@ METHODS = {
     "nearest_neighbor": "Nearest neighbour",
     "continuous_output": "Continuous output",
     "ours_mlp_encoder": "Ours, MLP encoder",
+    "ours_bilinear": "Ours, bilinear utility",
 }
 TITLES = {
     "gridworld": "Grid World, success rate",
