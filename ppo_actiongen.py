@@ -795,12 +795,13 @@ def rollout(envs, obs, agent, preprocess, num_steps, generator, device, metric):
     for _ in range(num_steps):
         state, available = preprocess(obs["state"]), torch.as_tensor(obs["available"])
         action, logprob, value = agent.act(state.to(device), available.to(device), P, generator)
-        raw = obs["state"]
+        step = dict(state=state, available=available, logprob=logprob, value=value) | action
+        if preprocess.normalizes:
+            step["raw"] = obs["state"]  # for its running statistics
         obs, reward, terminated, truncated, infos = envs.step(to_env(action))
         # Time limits count as ends: they are part of these tasks and short (published code).
         done = terminated | truncated
-        step = dict(state=state, available=available, logprob=logprob, value=value, raw=raw)
-        steps.append(step | action | dict(reward=reward, done=done))
+        steps.append(step | dict(reward=reward, done=done))
         if done.any():
             final, episode = infos["final_info"], infos["final_info"]["episode"]
             episodes += zip(
@@ -809,9 +810,7 @@ def rollout(envs, obs, agent, preprocess, num_steps, generator, device, metric):
     batch = {
         key: torch.stack([torch.as_tensor(s[key]) for s in steps])  # (T, N, ...)
         for key in steps[0]
-        if key != "raw"
     }
-    batch["raw"] = np.stack([s["raw"] for s in steps])  # (T, N, ...)
     return batch, obs, episodes
 
 
@@ -1320,8 +1319,7 @@ def train(args: Args) -> dict:
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
         losses = update(run.agent, run.optimizer, batch, ent_coef, args, run.generator, run.device)
         if run.preprocess.normalizes:
-            raw = batch["raw"]  # (T, N, ...)
-            run.preprocess.stats.update(raw.reshape(-1, *raw.shape[2:]))
+            run.preprocess.stats.update(batch["raw"].flatten(0, 1).numpy())  # (T*N, ...)
         run.update_index += 1
         step = run.update_index * run.batch_size
         bar.update(run.batch_size)

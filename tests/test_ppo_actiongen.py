@@ -41,6 +41,12 @@ def make_agent(action_space=None, state_space=VECTOR, **changes):
     return ppo.Agent(state_space, space, table, np.arange(20), args, ppo.Workers(2)), args
 
 
+@pytest.fixture(autouse=True)
+def seeded():
+    """Every test draws its inputs from the same place."""
+    torch.manual_seed(0)
+
+
 def random_sets(rows, K=5, A=30, seed=0):
     rng = np.random.default_rng(seed)
     return torch.as_tensor(np.stack([rng.choice(A, K, replace=False) for _ in range(rows)]))
@@ -115,7 +121,8 @@ def test_initial_policy_of_the_paper_is_uniform():
     agent, _ = make_agent(utility_gains=(0.01, 0.01, 0.01))
     with torch.no_grad():
         logits = agent.choice_logits(torch.randn(9, 64), random_sets(9), agent.project_actions())
-    assert logits.abs().max() < 1e-4
+    # A constant per state does not matter to the softmax; the spread over actions does.
+    assert (logits.max(1).values - logits.min(1).values).max() < 1e-5
 
 
 def test_one_hot_layer_equals_the_product_with_a_one_hot_vector():
@@ -445,7 +452,7 @@ def test_broken_checkpoints_are_refused(finished, tmp_path):
     good = (finished[0] / "checkpoint.pt").read_bytes()
     for name, content in {
         "truncated": good[: len(good) // 2],
-        "pickle": pickle.dumps({"agent": 1}),
+        "pickle": pickle.dumps({"agent": 1}, protocol=2),
         "empty": b"",
         "foreign": None,
     }.items():
