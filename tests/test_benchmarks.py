@@ -67,6 +67,7 @@ def test_merging_replaces_rows_of_the_same_key_and_keeps_the_rest(tmp_path):
 def test_every_method_of_the_matrix_has_a_label():
     methods = {m for name, e in paper.EXPERIMENTS.items() for m in e if "-recipe" not in name}
     assert methods <= set(report.METHODS)
+    assert set(paper.EXPERIMENTS["gridworld-recipe"]) == set(report.RECIPE)
 
 
 def test_published_scores_are_found():
