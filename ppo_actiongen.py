@@ -1341,7 +1341,10 @@ def train(args: Args) -> dict:
                 seed = seeds(args, 3, run.update_index, k)
                 row[f"{phase}_score"] = float(run.score(phase, args.valid_episodes, seed)["score"])
             valid_score = row["valid_score"]
-            bar.set_postfix(valid=f"{valid_score:.3f}", train=f"{row['train_score']:.3f}")
+            line = {"valid": f"{valid_score:.3f}", "train": f"{row['train_score']:.3f}"}
+            bar.set_postfix(line)
+            if bar.disable:  # in a file or a notebook: one plain line per evaluation
+                print(f"step {step:,}: train {line['train']}, valid {line['valid']}", flush=True)
         row["seconds"] = run.seconds = time.perf_counter() - start
         metrics.write(row)
         if writer:
