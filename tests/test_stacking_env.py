@@ -344,7 +344,7 @@ def test_every_shape_still_stands_after_the_full_300_steps():
         env._settle()
         (position,), (rotation,) = env.poses()
         assert abs(position[2] - stacking_env.lowest(shape_id)) < 0.002, shape_id
-        assert np.abs(position - start)[:2].max() < 0.015, shape_id  # the solver's creep
+        assert np.abs(position - start)[:2].max() < 0.006, shape_id
         assert np.abs(rotation - upright).max() < 0.03, shape_id
     env.close()
 
@@ -395,7 +395,7 @@ def test_mean_heights_on_the_published_draw_of_scales():
     assert len(train) == 405
     for pool in (train, np.setdiff1d(np.arange(810), train)):
         assert abs(mean_height("random", 150, action_pool=pool) - 1.63) < 0.2
-        assert abs(mean_height("greedy", 80, action_pool=pool) - 5.39) < 0.6
+        assert abs(mean_height("greedy", 80, action_pool=pool) - 5.39) < 0.5
     # early stopping changes the scores of random play by no more than noise
     assert abs(mean_height("random", 80, early_stop=False) - 1.65) < 0.25
 
