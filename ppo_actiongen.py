@@ -14,6 +14,7 @@ model selection on held-out *validation* actions. The test actions are used once
     python ppo_actiongen.py gridworld --recipe paper # Tables 3 and 4 to the letter
     python ppo_actiongen.py gridworld --method nearest-neighbor        # baselines of section 5.3
     python ppo_actiongen.py gridworld --ent-coef 0 | --no-subsample    # ablations
+    python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0 # C.2: adapt to the unseen
     python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --actions test --num-available 20
     python ppo_actiongen.py gridworld --help         # every hyper-parameter and its default
 
@@ -104,6 +105,12 @@ class Args:
     placement: str | None = None
     """Stacking: none | 1d | 2d (C.6)."""
 
+    # Adaptation to the unseen actions (C.2), the alternative to zero-shot
+    adapt: bool = False
+    """Train on all test actions, one fixed set in every episode, from scratch."""
+    finetune: str | None = None
+    """--adapt, starting from this finished run's folder; give the flags of that run."""
+
     # Policy, Table 3 (per environment, see PRESETS)
     ent_coef: float = 0.05
     """Entropy coefficient (Table 3); 0 is the ablation without entropy."""
@@ -169,6 +176,9 @@ class Args:
     """mlp = D.3.2; bilinear = code . M c, too plain to learn single actions by heart (ours)."""
     utility_hidden: int | None = None
     """Hidden width of the utility alone (default: hidden_size; wider is beyond the paper)."""
+
+    aux_conditioned: bool = False
+    """The position head also sees the chosen action (C.4)."""
 
     # Protocol
     eval_every: int = 410_000
@@ -481,12 +491,21 @@ class Agent(nn.Module):
             self.head_var = layer_init(nn.Linear(H, D), 1.0, generator)
         heads = action_space.spaces if isinstance(action_space, gym.spaces.Dict) else {}
         self.has_position, self.has_stop = "position" in heads, "stop" in heads
+        self.aux_conditioned = args.aux_conditioned
         if self.has_position:
             d = heads["position"].shape[-1]
-            self.fc_alpha = layer_init(nn.Linear(H, d), 1.0, generator)
-            self.fc_beta = layer_init(nn.Linear(H, d), 1.0, generator)
+            self.fc_alpha, self.fc_beta = (self.position_head(H, d, args, generator) for _ in "ab")
         if self.has_stop:
             self.fc_stop = layer_init(nn.Linear(H, 2), 0.01, generator)
+
+    @staticmethod
+    def position_head(H, d, args: Args, generator):
+        """D.3.2: code -> d numbers; C.4: [code; projected action] -> hidden layer -> d numbers."""
+        if not args.aux_conditioned:
+            return layer_init(nn.Linear(H, d), 1.0, generator)
+        layers = nn.Linear(2 * H, H), nn.Linear(H, d)  # gains: published code
+        first, last = (layer_init(layer, 1.0, generator) for layer in layers)
+        return nn.Sequential(first, nn.ReLU(), last)
 
     def encode(self, state):
         """State (B, ...) -> code (B, H) and value (B,)."""
@@ -533,14 +552,18 @@ class Agent(nn.Module):
         offered = self.table[available]  # (B, K, D)
         return (offered - wish[:, None]).square().sum(-1).argmin(1)
 
-    def auxiliary(self, code, noise=None, action=None):
+    def auxiliary(self, code, noise=None, action=None, taken=None):
         """f_chi: position ~ Beta on [-1, 1] per dimension, stop ~ Categorical(2).
 
         Draws them when `action` is None. Returns the heads' values, summed log-probability (B,)
-        and entropy (B,), the position's scaled by `aux_ent_scale`.
+        and entropy (B,), the position's scaled by `aux_ent_scale`. `taken` (B,), the ids of the
+        chosen actions, is what the position also depends on with --aux-conditioned (C.4).
         """
         out, logprob, entropy = {}, 0.0, 0.0
+        stop_code = code
         if self.has_position:
+            if self.aux_conditioned:  # (B, H), (B, H) -> (B, 2H); the utility's own projection
+                code = torch.cat([code, self.action_project(self.table[taken])], dim=1)
             # alpha, beta >= 1: a single peak, never piled up at both borders (D.3.2)
             alpha, beta = 1 + F.softplus(self.fc_alpha(code)), 1 + F.softplus(self.fc_beta(code))
             if action is None:
@@ -555,7 +578,7 @@ class Agent(nn.Module):
             logprob = logprob + dist.log_prob(unit).sum(1)
             entropy = entropy + self.aux_ent_scale * dist.entropy().sum(1)
         if self.has_stop:
-            logp = F.log_softmax(self.fc_stop(code), dim=1)  # (B, 2)
+            logp = F.log_softmax(self.fc_stop(stop_code), dim=1)  # (B, 2)
             out["stop"] = sample(logp, noise) if action is None else action["stop"]
             logprob = logprob + logp.gather(1, out["stop"][:, None])[:, 0]
             entropy = entropy - (logp.exp() * logp).sum(1)
@@ -585,7 +608,9 @@ class Agent(nn.Module):
                 action["head"] = choice
                 choice = self.nearest(self.table[self.train_ids[choice]], available)
             action["choice"] = choice
-        aux, aux_logprob, _ = self.auxiliary(code, generator)
+        if self.aux_conditioned:
+            action["taken"] = available.gather(1, action["choice"][:, None])[:, 0]  # (B,) ids
+        aux, aux_logprob, _ = self.auxiliary(code, generator, taken=action.get("taken"))
         return action | aux, logprob + aux_logprob, value
 
     def logprob_entropy(self, code, available, action, P):
@@ -601,7 +626,9 @@ class Agent(nn.Module):
             taken = action["choice" if self.method == "utility" else "head"]
             logprob = logp.gather(1, taken[:, None])[:, 0]
             entropy = -(logp.exp() * logp).sum(1)
-        _, aux_logprob, aux_entropy = self.auxiliary(code, action=action)
+        _, aux_logprob, aux_entropy = self.auxiliary(
+            code, action=action, taken=action["taken"] if self.aux_conditioned else None
+        )
         return logprob + aux_logprob, entropy + aux_entropy
 
 
@@ -667,9 +694,9 @@ def action_pools(args: Args) -> tuple[dict[str, np.ndarray], np.ndarray, int]:
     """The three pools of the split, the pool trained on and how many of it are on offer."""
     module = importlib.import_module(MODULES[args.env])
     pools = module.split_actions(args.split, args.split_seed)
-    pool, num_available = pools["train"], args.num_available
-    # The nearest-neighbour baseline and the ablation see one fixed set in every episode.
-    fixed = args.method == "nearest-neighbor" or not args.subsample
+    pool, num_available = pools["test" if args.adapt else "train"], args.num_available
+    # The nearest-neighbour baseline, the ablation and adaptation see one set in every episode.
+    fixed = args.method == "nearest-neighbor" or args.adapt or not args.subsample
     if fixed:
         size = args.fixed_set_size if args.method == "utility" else None
         if size is not None and size < len(pool):
@@ -958,6 +985,9 @@ def write_atomically(path: Path, write) -> None:
 
 def method_name(args: Args) -> str:
     """The method's name in results/published_results.csv, so that the two files join."""
+    if args.adapt:
+        policy = "ours" if args.method == "utility" else "discrete"
+        return f"{policy}_finetuned" if args.finetune else f"{policy}_from_scratch"
     if args.method != "utility":
         name = {"nearest-neighbor": "nearest_neighbor", "continuous": "continuous_output"}
         return name[args.method]
@@ -975,7 +1005,16 @@ def method_name(args: Args) -> str:
     )
     if args.utility == "bilinear":
         return "ours_bilinear"  # beyond the paper
-    return "ours" if modality_is_default else "ours_alternate_modality"
+    if not modality_is_default:
+        return "ours_video" if args.modality == "video" else "ours_alternate_modality"
+    variants = {
+        "ours_full_split": args.split == "full",
+        "ours_conditioned_auxiliary": args.aux_conditioned,
+        "ours_no_subgoal_reward": not args.subgoal_reward,
+        "ours_no_place": args.placement == "none",
+        "ours_2d_place": args.placement == "2d",
+    }
+    return next((name for name, chosen in variants.items() if chosen), "ours")
 
 
 def experiment_name(args: Args) -> str:
@@ -1056,10 +1095,12 @@ def plot_curve(metrics: Path, path: Path, metric: str, published: dict, ceiling)
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    rows = [r for r in csv.DictReader(metrics.open()) if r["valid_score"]]
+    rows = [r for r in csv.DictReader(metrics.open()) if r["train_score"]]
     steps = [int(r["step"]) / 1e6 for r in rows]
     figure, axis = plt.subplots(figsize=(6, 4))
     for name, label in (("train_score", "training actions"), ("valid_score", "validation actions")):
+        if not rows or not rows[0][name]:
+            continue  # adaptation has no validation actions
         axis.plot(steps, [float(r[name]) for r in rows], marker=".", label=label)
     if ceiling is not None:
         axis.axhline(ceiling, color="grey", lw=1, label="ceiling")
@@ -1106,7 +1147,10 @@ def record_episode(agent, preprocess, args: Args, pool, path: Path) -> None:
 def print_table(results: dict, metric: str) -> None:
     """The last thing on the screen: seen against unseen actions, published score, ceiling."""
     print(f"\n{metric:10} {'ours':>16} {'published':>10} {'ceiling':>8}   ({results['method']})")
-    for phase, label in (("train", "seen"), ("valid", "validation"), ("test", "unseen")):
+    labels = {"train": "seen", "valid": "validation", "test": "unseen"}
+    if "test" not in results:
+        labels = {"train": "adapted to"}
+    for phase, label in labels.items():
         ours, published = results[phase], results["published"].get(phase)
         ceiling = results["ceiling"][phase]
         print(
@@ -1137,6 +1181,14 @@ def check(args: Args) -> None:
     for name in ("fully_observable", "placement"):
         if getattr(args, name) and name not in TASK_OPTIONS[args.env]:
             raise ValueError(f"{name} is not an option of {args.env}")
+    if args.adapt and args.method == "continuous":
+        raise ValueError("adapt: method 'continuous' is not one of utility, nearest-neighbor")
+    if args.aux_conditioned and (args.method, args.utility) != ("utility", "mlp"):
+        raise ValueError("aux_conditioned needs method 'utility' with utility 'mlp'")
+    if args.aux_conditioned and (
+        args.env not in ("create", "stacking") or args.placement == "none"
+    ):
+        raise ValueError("aux_conditioned: there is no position to choose here")
     if args.device not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device {args.device!r} is not one of auto, cpu, cuda")
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -1202,9 +1254,15 @@ class Run:
                 f"total_timesteps {args.total_timesteps} is less than one rollout of "
                 f"{self.batch_size} (minibatch_size x num_minibatches)"
             )
+        self.phases = ("train",) if args.adapt else ("train", "valid", "test")
         self.folder, checkpoint = open_run(args, self.device)
         self.envs = make_envs(args, self.pool, args.num_envs, self.num_available, seeds(args, 1, 0))
-        self.build(load_table(args, self.pools["train"]), checkpoint)
+        try:
+            self.build(load_table(args, self.pools["train"]), checkpoint)
+        except (ValueError, FileNotFoundError):
+            if not any(self.folder.iterdir()):
+                self.folder.rmdir()  # a refused run leaves nothing
+            raise
 
     def build(self, table, checkpoint) -> None:
         """Create (or restore) everything that learns."""
@@ -1230,6 +1288,8 @@ class Run:
         self.generator = torch.Generator(self.device).manual_seed(seeds(args, 2))
         self.scale = RewardScale(args.num_envs, args.gamma)
         self.update_index, self.seconds, self.best_score = 0, 0.0, -math.inf
+        if args.finetune and not checkpoint:
+            self.start_from(Path(args.finetune))
         if checkpoint:
             self.agent.load_state_dict(checkpoint["agent"])
             self.optimizer.load_state_dict(checkpoint["optimizer"])
@@ -1238,6 +1298,27 @@ class Run:
             self.scale.stats.load(checkpoint["reward_stats"])
             self.update_index = checkpoint["update_index"]
             self.seconds, self.best_score = checkpoint["seconds"], checkpoint["best_score"]
+
+    def start_from(self, folder: Path) -> None:
+        """C.2: take over the policy of a finished run, with a fresh optimiser.
+
+        The discrete policy's outputs are training actions, so that head starts anew, and with it
+        the stop head (published code). The statistics of the states stand still from here on.
+        Raises ValueError when the run was trained with other networks or another table.
+        """
+        best = load_checkpoint(folder / "best.pt", self.device)
+        theirs, own = best["agent"], self.agent.state_dict()
+        discrete = self.args.method == "nearest-neighbor"
+        anew = ("train_ids", "head.", "fc_stop.") if discrete else ("train_ids",)
+        for name in set(own) | set(theirs):
+            if name.startswith(anew):
+                theirs[name] = own[name]
+            elif name not in own or name not in theirs or own[name].shape != theirs[name].shape:
+                raise ValueError(f"cannot fine-tune {folder}: its networks differ ({name})")
+        if not torch.equal(theirs["table"], own["table"]):
+            raise ValueError(f"cannot fine-tune {folder}: its representations are other ones")
+        self.agent.load_state_dict(theirs)
+        self.preprocess.load(best["preprocess"])
 
     def save(self, name: str) -> None:
         """Write checkpoint.pt or best.pt."""
@@ -1289,7 +1370,7 @@ def train(args: Args) -> dict:
         desc=run.folder.name,
         disable=None,  # silent when not a terminal
     )
-    start, valid_score = time.perf_counter() - run.seconds, float("nan")
+    start = time.perf_counter() - run.seconds
     while run.update_index < run.num_updates:
         began = time.perf_counter()
         fraction = 1 - min(1.0, run.update_index / lr_updates)
@@ -1318,7 +1399,7 @@ def train(args: Args) -> dict:
         # Learn, then let the normaliser catch up with what was seen.
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
         losses = update(run.agent, run.optimizer, batch, ent_coef, args, run.generator, run.device)
-        if run.preprocess.normalizes:
+        if run.preprocess.normalizes and not args.finetune:
             run.preprocess.stats.update(batch["raw"].flatten(0, 1).numpy())  # (T*N, ...)
         run.update_index += 1
         step = run.update_index * run.batch_size
@@ -1337,22 +1418,23 @@ def train(args: Args) -> dict:
         }
         at_end = run.update_index == run.num_updates
         if run.update_index % eval_every == 0 or at_end:
-            for k, phase in enumerate(("train", "valid")):
+            for k, phase in enumerate(run.phases[:2]):
                 seed = seeds(args, 3, run.update_index, k)
                 row[f"{phase}_score"] = float(run.score(phase, args.valid_episodes, seed)["score"])
-            valid_score = row["valid_score"]
-            line = {"valid": f"{valid_score:.3f}", "train": f"{row['train_score']:.3f}"}
+            # Model selection, on validation actions only [adaptation: on what it adapts to].
+            selection_score = row[f"{run.phases[:2][-1]}_score"]
+            line = {phase: f"{row[f'{phase}_score']:.3f}" for phase in run.phases[:2]}
             bar.set_postfix(line)
             if bar.disable:  # in a file or a notebook: one plain line per evaluation
-                print(f"step {step:,}: train {line['train']}, valid {line['valid']}", flush=True)
+                print(f"step {step:,}: {', '.join(map(' '.join, line.items()))}", flush=True)
         row["seconds"] = run.seconds = time.perf_counter() - start
         metrics.write(row)
         if writer:
             for key, value in row.items():
                 writer.add_scalar(key, value, step)
-        if "valid_score" in row:
-            if valid_score > run.best_score:  # model selection, on validation actions only
-                run.best_score = valid_score
+        if "train_score" in row:
+            if selection_score > run.best_score:
+                run.best_score = selection_score
                 run.save("best.pt")
             run.save("checkpoint.pt")
             obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index))
@@ -1372,7 +1454,7 @@ def finish(run: Run) -> dict:
     run.preprocess.load(best["preprocess"])
     results = {
         phase: run.score(phase, args.eval_episodes, seeds(args, 4, k))
-        for k, phase in enumerate(("train", "valid", "test"))
+        for k, phase in enumerate(run.phases)
     }
     seen, unseen = CEILINGS.get(experiment_name(args), (None, None))
     results |= {
@@ -1416,17 +1498,72 @@ class EvaluateArgs:
     """Seed of environments and action sampling."""
     greedy: bool = False
     """Take the most probable action instead of sampling."""
+    min_angle_gap: float | None = None
+    """CREATE: only tools at least so many degrees from every training tool of their class."""
+    min_embedding_distance: str | None = None
+    """Only actions whose representation is farther than this squared distance from that of every
+    training action; q0.5: farther than this quantile of the pool."""
+    unseen_ratio: float | None = None
+    """Offer a mixture: this share of the pool's actions, the rest training actions."""
+    save: bool = False
+    """Write the score to evaluations.csv in the run's folder as well."""
+
+
+EVALUATION_KEYS = (
+    "actions num_available min_angle_gap min_embedding_distance unseen_ratio greedy episodes seed"
+).split()
+
+
+def restrict_pool(options: EvaluateArgs, args: Args, table, pool, train_ids) -> np.ndarray:
+    """The analyses of A.3: which actions of `pool` (n,) are on offer, sorted ids.
+
+    An action of both pools (CREATE's no-op) always stays. Raises ValueError for a bad value.
+    """
+    module = importlib.import_module(MODULES[args.env])
+    always, keep = np.isin(pool, train_ids), np.ones(len(pool), bool)
+    if options.min_angle_gap is not None:
+        if not hasattr(module, "angle_gaps"):
+            raise ValueError(f"min_angle_gap: {args.env} has no angles")
+        keep &= module.angle_gaps(pool, train_ids) >= options.min_angle_gap
+    if options.min_embedding_distance is not None:
+        squared = torch.cdist(table[pool], table[train_ids]).square()  # (n, D), (m, D) -> (n, m)
+        nearest = squared.amin(1).numpy()  # (n,)
+        text = options.min_embedding_distance
+        try:
+            least = float(text.removeprefix("q"))
+            # Published: absolute distances, which depend on the scale of the encoder's table.
+            least = float(np.quantile(nearest[~always], least)) if text[0] == "q" else least
+        except (ValueError, IndexError):
+            raise ValueError(
+                f"min_embedding_distance {text!r} is neither a number nor q with a quantile in 0..1"
+            ) from None
+        keep &= nearest >= least
+    pool, shared = pool[keep & ~always], pool[always]
+    ratio = options.unseen_ratio
+    if ratio is not None:
+        if not 0 <= ratio <= 1:
+            raise ValueError(f"unseen_ratio {ratio} is not in 0..1")
+        rng = np.random.default_rng(options.seed)
+        seen = np.setdiff1d(train_ids, shared)
+        # Both shares come from pools of one size, so that the ratio is that of what is offered.
+        size = min(len(pool), len(seen))
+        count = round(ratio * size)
+        unseen = rng.choice(pool, count, replace=False)
+        pool = np.concatenate([unseen, rng.choice(seen, size - count, replace=False)])
+    return np.sort(np.concatenate([shared, pool]))
 
 
 def evaluate_run(options: EvaluateArgs) -> dict:
     """`python ppo_actiongen.py evaluate RUN ...`"""
     checkpoint = load_checkpoint(Path(options.run) / "best.pt", "cpu")
-    saved = {f.name: checkpoint["args"][f.name] for f in fields(Args)}
+    saved = {f.name: checkpoint["args"].get(f.name, f.default) for f in fields(Args)}
     saved["utility_gains"] = tuple(saved["utility_gains"])
     args = Args(**saved)
     pools, pool, _ = action_pools(args)
     if options.actions != "train":
         pool = pools[options.actions]
+    table, train_ids = (checkpoint["agent"][k].numpy() for k in ("table", "train_ids"))
+    pool = restrict_pool(options, args, checkpoint["agent"]["table"], pool, train_ids)
     K = options.num_available or args.eval_available or args.num_available
     if not 1 <= K <= len(pool) or options.episodes < 1:
         raise ValueError(f"num_available {K} is not in 1..{len(pool)}, or episodes is below 1")
@@ -1434,14 +1571,24 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     spaces = envs.single_observation_space, envs.single_action_space
     preprocess = Preprocess(spaces[0]["state"], args, checkpoint["preprocess"]["ids"].numpy())
     preprocess.load(checkpoint["preprocess"])
-    table, train_ids = (checkpoint["agent"][k].numpy() for k in ("table", "train_ids"))
     agent = Agent(preprocess.space, spaces[1], table, train_ids, args, Workers(1))
     agent.load_state_dict(checkpoint["agent"])
     result = evaluate(
         agent, preprocess, args, pool, options.episodes, options.seed, K, options.greedy
     )
-    print(f"{options.actions} actions, K={K}, {result['episodes']} episodes: ", end="")
+    print(
+        f"{options.actions} actions, K={K} of {len(pool)}, {result['episodes']} episodes: ", end=""
+    )
     print(f"{result['score']:.4f} ± {result['stderr']:.4f}")
+    if options.save:
+        path = Path(options.run) / "evaluations.csv"
+        named = asdict(options) | {"num_available": K, "pool_size": len(pool)} | result
+        columns = EVALUATION_KEYS + "pool_size score stderr return length".split()
+        row = {k: "" if named[k] is None else str(named[k]) for k in columns}
+        old = list(csv.DictReader(path.open())) if path.exists() else []
+        rows = [r for r in old if any(r[k] != row[k] for k in EVALUATION_KEYS)] + [row]
+        text = "\n".join([",".join(columns), *(",".join(r[k] for k in columns) for r in rows)])
+        write_atomically(path, lambda temporary: temporary.write_text(text + "\n"))
     return result
 
 
@@ -1475,7 +1622,8 @@ def main() -> None:
         words = [w for a in argv for w in a.split("=")]
         recipe = words[words.index("--recipe") + 1] if "--recipe" in words[:-1] else "fast"
         default = default_args(argv[0], recipe, "--quick" in words)
-        train(tyro.cli(Args, args=argv[1:], default=default))
+        args = tyro.cli(Args, args=argv[1:], default=default)
+        train(replace(args, adapt=args.adapt or args.finetune is not None))
     except (ValueError, FileNotFoundError) as e:
         raise SystemExit(f"error: {e}") from None
 

@@ -486,3 +486,172 @@ def test_learning_reaches_unseen_skills(tmp_path):
     assert run(command(tmp_path, *extra, steps=600_000)).returncode == 0
     results = json.loads((tmp_path / "gridworld-engineered-s0" / "results.json").read_text())
     assert results["test"]["score"] > 0.15  # a random policy: 0.003
+
+
+# ---- C.2 adaptation, C.4 conditioned position head, the analyses of A.3 ----
+
+
+def test_conditioned_position_head_is_the_mlp_of_code_and_chosen_action():
+    agent, _ = make_agent(HYBRID, aux_conditioned=True)
+    code, available = torch.randn(7, 64), random_sets(7)
+    generator = torch.Generator().manual_seed(0)
+    P = agent.project_actions()
+    action, logprob, _ = agent.act(torch.randn(7, 7), available, P, generator)
+    ids = available[torch.arange(7), action["choice"]]
+    assert torch.equal(action["taken"], ids)
+    # Slow and obvious: one sample at a time, alpha and beta from [code; projected action].
+    _, together, _ = agent.auxiliary(code, action=action, taken=ids)
+    for i in range(7):
+        c = agent.action_project(agent.table[ids[i]])
+        heads = [
+            1 + F.softplus(head(torch.cat([code[i], c])))
+            for head in (agent.fc_alpha, agent.fc_beta)
+        ]
+        density = torch.distributions.Beta(*heads).log_prob((action["position"][i] + 1) / 2).sum()
+        stop = F.log_softmax(agent.fc_stop(code[i]), 0)[action["stop"][i]]
+        assert torch.allclose(together[i], density + stop, atol=1e-5)
+    # Another choice, another distribution; without the flag there is none of this.
+    _, other, _ = agent.auxiliary(code, action=action, taken=(ids + 1) % 30)
+    assert not torch.allclose(together, other)
+    plain, _ = make_agent(HYBRID)
+    assert torch.equal(
+        plain.auxiliary(code, action=action)[1], plain.auxiliary(code, action=action, taken=ids)[1]
+    )
+
+
+def test_conditioned_head_reproduces_the_log_probabilities_of_the_rollout():
+    agent, _ = make_agent(HYBRID, aux_conditioned=True)
+    state, available = torch.randn(9, 7), random_sets(9)
+    P, generator = agent.project_actions(), torch.Generator().manual_seed(1)
+    action, logprob, _ = agent.act(state, available, P, generator)
+    again, _ = agent.logprob_entropy(agent.encode(state)[0], available, action, P)
+    assert torch.allclose(again, logprob, atol=1e-5)
+
+
+def small(tmp_path, *extra):
+    """A short Grid World run through main(); returns its folder's parent."""
+    words = "--representation engineered --threads 1 --minibatch-size 64 --eval-every 256"
+    words += " --valid-episodes 4 --eval-episodes 8 --no-tensorboard --total-timesteps 1024"
+    return ["ppo", "gridworld", *words.split(), "--runs-dir", str(tmp_path), *extra]
+
+
+@pytest.mark.parametrize("method", ["utility", "nearest-neighbor"])
+def test_adaptation_trains_on_the_fixed_test_set_from_scratch_or_from_a_run(
+    tmp_path, method, monkeypatch
+):
+    policy = {"utility": "ours", "nearest-neighbor": "discrete"}[method]
+    start = {"utility": "engineered", "nearest-neighbor": "nearest_neighbor"}[method]
+    folder = tmp_path / f"gridworld-{start}-s0"
+    method = ["--method", method]
+    for extra in ([], ["--adapt"], ["--finetune", str(folder)]):
+        monkeypatch.setattr(sys, "argv", small(tmp_path, *method, *extra))
+        ppo.main()
+    test_ids = gridworld.split_actions()["test"]
+    for name in (f"{policy}_from_scratch", f"{policy}_finetuned"):
+        run = tmp_path / f"gridworld-{name}-s0"
+        results = json.loads((run / "results.json").read_text())
+        assert "test" not in results and results["train"]["episodes"] == 8
+        best = ppo.load_checkpoint(run / "best.pt", "cpu")
+        assert np.array_equal(best["agent"]["train_ids"], test_ids)
+        rows = list(csv.DictReader((run / "metrics.csv").open()))
+        assert all(r["train_score"] and not r["valid_score"] for r in rows)
+
+
+def test_finetuning_starts_from_the_weights_of_the_run_and_resets_only_the_discrete_head(
+    tmp_path, monkeypatch
+):
+    for method in ("utility", "nearest-neighbor"):
+        argv = small(tmp_path, "--method", method, "--run-name", method)
+        monkeypatch.setattr(sys, "argv", argv)
+        ppo.main()
+        words = [*argv[2:], "--run-name", f"{method}-more", "--finetune", str(tmp_path / method)]
+        args = tyro_args([*words, "--adapt"])
+        run = ppo.Run(args)
+        theirs = ppo.load_checkpoint(tmp_path / method / "best.pt", "cpu")["agent"]
+        own = run.agent.state_dict()
+        same = {
+            k for k in own if own[k].shape == theirs[k].shape and torch.equal(own[k], theirs[k])
+        }
+        fresh = {"train_ids"} | ({"head.weight", "head.bias"} if method != "utility" else set())
+        # A bias of zeros may agree by chance of its initial value.
+        assert set(own) - same <= fresh and "train_ids" not in same
+        assert run.optimizer.state_dict()["state"] == {}
+
+
+def tyro_args(words):
+    return ppo.tyro.cli(ppo.Args, args=words, default=ppo.default_args("gridworld", "fast", False))
+
+
+@pytest.mark.parametrize(
+    "extra, words",
+    [
+        (["--finetune", "nowhere"], "no checkpoint"),
+        (["--adapt", "--method", "continuous"], "continuous"),
+        (["--aux-conditioned"], "no position"),
+    ],
+)
+def test_adaptation_refuses_with_one_line_and_leaves_nothing(tmp_path, extra, words, monkeypatch):
+    monkeypatch.setattr(sys, "argv", small(tmp_path, *extra))
+    with pytest.raises(SystemExit) as e:
+        ppo.main()
+    assert words in str(e.value) and "\n" not in str(e.value)
+    assert not any(tmp_path.iterdir())
+
+
+def test_finetuning_refuses_another_policy_or_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", small(tmp_path))
+    ppo.main()
+    run = str(tmp_path / "gridworld-engineered-s0")
+    other = ["--representation", "engineered-5d"], ["--method", "nearest-neighbor"]
+    for extra in other:
+        monkeypatch.setattr(sys, "argv", small(tmp_path, *extra, "--finetune", run))
+        with pytest.raises(SystemExit, match="cannot fine-tune"):
+            ppo.main()
+    assert [p.name for p in tmp_path.iterdir()] == ["gridworld-engineered-s0"]
+
+
+def test_pools_of_the_analyses():
+    import create_env
+
+    split = create_env.split_actions("analysis")
+    train, test = split["train"], split["test"]
+    args = replace(ppo.PRESETS["create"], split="analysis")
+    table = torch.randn(create_env.NUM_ACTIONS, 3, generator=torch.Generator().manual_seed(0))
+
+    def pool(**options):
+        return ppo.restrict_pool(ppo.EvaluateArgs(run="", **options), args, table, test, train)
+
+    sizes = [len(pool(min_angle_gap=gap)) for gap in (3, 6, 9, 12, 15)]
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] > 50
+    far = pool(min_angle_gap=9)
+    assert create_env.NO_OP in far
+    assert (create_env.angle_gaps(far[far != create_env.NO_OP], train) >= 9).all()
+    # Embedding distance: by brute force over a few tools; q0.5 keeps half of them.
+    far = set(pool(min_embedding_distance="0.05"))
+    for tool in test[1:30]:
+        nearest = min(float((table[tool] - table[t]).square().sum()) for t in train)
+        assert (tool in far) == (nearest >= 0.05)
+    assert len(pool(min_embedding_distance="q0.5")) == pytest.approx(len(test) / 2, abs=2)
+    # Unseen ratio: that share of the pool, the rest training tools; the no-op is in both.
+    for ratio in (0.0, 0.2, 0.6, 1.0):
+        mixed = pool(unseen_ratio=ratio)
+        tools = mixed[mixed != create_env.NO_OP]
+        assert len(np.unique(mixed)) == len(mixed)
+        assert np.isin(tools, test).mean() == pytest.approx(ratio, abs=0.001)
+        assert np.isin(tools, np.union1d(train, test)).all()
+    for bad in (dict(unseen_ratio=1.5), dict(min_embedding_distance="q7")):
+        with pytest.raises(ValueError):
+            pool(**bad)
+
+
+def test_saved_evaluations_replace_their_own_row(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", small(tmp_path))
+    ppo.main()
+    run = str(tmp_path / "gridworld-engineered-s0")
+    common = dict(run=run, episodes=8, save=True)
+    for options in (dict(), dict(num_available=10), dict(), dict(unseen_ratio=0.5)):
+        ppo.evaluate_run(ppo.EvaluateArgs(**common, **options))
+    rows = list(csv.DictReader((Path(run) / "evaluations.csv").open()))
+    assert [r["num_available"] for r in rows] == ["10", "50", "50"]
+    assert [r["unseen_ratio"] for r in rows] == ["", "", "0.5"]
+    assert all(0 <= float(r["score"]) <= 1 and r["episodes"] == "8" for r in rows)
