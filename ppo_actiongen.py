@@ -177,6 +177,8 @@ class Args:
     utility_hidden: int | None = None
     """Hidden width of the utility alone (default: hidden_size; wider is beyond the paper)."""
 
+    stop_bias: float = 0.0
+    """Initial logit of going on, against stopping (ours; the paper: 0)."""
     aux_conditioned: bool = False
     """The position head also sees the chosen action (C.4)."""
 
@@ -269,8 +271,23 @@ FAST = {
         standardize=True,
         total_timesteps=10_000_000,
     ),
-    "create": dict(utility_gains=(1.0, math.sqrt(2), 0.01)),
-    "stacking": dict(utility_gains=(1.0, math.sqrt(2), 0.01)),
+    "create": dict(
+        utility_gains=(1.0, math.sqrt(2), 0.01),
+        minibatch_size=512,  # rollouts of 64 steps: six times as many updates per step
+        clip_vloss=False,  # a goal is worth 10: with steps of 0.1 the critic needs 100 updates
+        lr_decay_steps=None,  # over the run
+        total_timesteps=4_000_000,
+        eval_every=205_000,
+    ),
+    "stacking": dict(
+        utility_gains=(1.0, math.sqrt(2), 0.01),
+        minibatch_size=256,  # rollouts of 32 steps
+        stop_bias=4.0,  # a fresh stop head ends episodes after two shapes, before any tower
+        clip_vloss=False,
+        lr_decay_steps=None,
+        total_timesteps=400_000,
+        eval_every=20_500,
+    ),
 }
 
 # --quick: the fast recipe with a smaller budget, never another algorithm.
@@ -497,6 +514,7 @@ class Agent(nn.Module):
             self.fc_alpha, self.fc_beta = (self.position_head(H, d, args, generator) for _ in "ab")
         if self.has_stop:
             self.fc_stop = layer_init(nn.Linear(H, 2), 0.01, generator)
+            nn.init.constant_(self.fc_stop.bias[0], args.stop_bias)
 
     @staticmethod
     def position_head(H, d, args: Args, generator):
