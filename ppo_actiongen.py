@@ -16,6 +16,7 @@ model selection on held-out *validation* actions. The test actions are used once
     python ppo_actiongen.py gridworld --ent-coef 0 | --no-subsample    # ablations
     python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0 # C.2: adapt to the unseen
     python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --actions test --num-available 20
+    torchrun --nproc_per_node=2 ppo_actiongen.py create                # data-parallel processes
     python ppo_actiongen.py gridworld --help         # every hyper-parameter and its default
 
 Paper map (appendix)                                  here
@@ -41,6 +42,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
+from datetime import timedelta
 from inspect import signature
 from pathlib import Path
 from typing import Literal
@@ -48,10 +50,14 @@ from typing import Literal
 import gymnasium as gym
 import numpy as np
 import torch
+import torch.distributed as dist
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
 from tqdm import tqdm
+
+# Set by torchrun; without it one process does everything.
+RANK, WORLD_SIZE = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
 
 # ---- hyper-parameters: Tables 3 and 4 ----
 
@@ -210,7 +216,11 @@ class Args:
     device: str = "auto"
     """auto | cpu | cuda."""
     threads: int = 2
-    """CPU threads of the update."""
+    """CPU threads of the update (torchrun: of each process, default 1)."""
+    micro_batch: int = 0
+    """Rows per forward and backward pass; gradients of a minibatch add up (0: all at once)."""
+    bf16: bool | None = None
+    """Convolutions in bfloat16 (default: where the processor has instructions for it)."""
     tensorboard: bool = True
     """Write TensorBoard events."""
 
@@ -236,6 +246,7 @@ PRESETS = {
         minibatch_size=3072,
         lr_decay_steps=100_000_000,  # published code: the horizon is longer than the run
         eval_every=615_000,  # published code: every 50 updates of 12,288 steps
+        micro_batch=64,  # ours: the activations of 64 images stay in the processor's cache
     ),
     "stacking": Args(
         env="stacking",
@@ -247,6 +258,7 @@ PRESETS = {
         lr_decay_steps=100_000_000,  # published code
         eval_every=102_400,  # published code: every 25 updates of 4,096 steps
         valid_episodes=200,  # ours; published code: 40, too few to choose by
+        micro_batch=64,  # ours, as above
     ),
 }
 
@@ -340,17 +352,29 @@ class OneHotLinear(torch.autograd.Function):
         return None, one_hot.T @ grad  # (rows, B) @ (B, out)
 
 
+def fast_bf16(device: torch.device) -> bool:
+    """Whether the device multiplies bfloat16 numbers faster than float32."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return bool(torch.cpu.get_capabilities().get("avx512_bf16"))
+
+
 class StateEncoder(nn.Module):
     """f_omega and the critic's trunk (D.3.2).
 
     Vector states: two separate 2-layer tanh MLPs, one for the policy and one for the critic.
-    Image states: five stride-2 convolutions, a linear layer and ReLU, shared by both.
+    Image states: five stride-2 convolutions, a linear layer and ReLU, shared by both. They are the
+    whole bill of a step, and two formats make them about twice as fast, forward and backward:
+      - channels last in memory, so that one pixel's channels are one vector of the processor;
+      - bfloat16 (float32's range, 8 bits of mantissa) in the convolutions alone. Sums inside a
+        convolution, weights, the optimiser and everything after the last layer stay float32.
+    tests/ hold plain float32 layers as the oracle of both.
     """
 
     def __init__(self, space: gym.spaces.Box, args: Args, generator: torch.Generator):
         super().__init__()
         H, root2 = args.hidden_size, math.sqrt(2)  # gain sqrt(2): published code
-        self.is_image = len(space.shape) == 3
+        self.is_image, self.bf16 = len(space.shape) == 3, args.bf16
         self.num_ids = int(space.high.max()) + 1 if args.one_hot else None  # see Preprocess
         if self.is_image:
             # 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side (published code; the appendix: 5 layers)
@@ -363,7 +387,10 @@ class StateEncoder(nn.Module):
                 nn.init.kaiming_uniform_(conv.weight, a=math.sqrt(5), generator=generator)
                 bound = 1 / math.sqrt(conv.weight[0].numel())
                 nn.init.uniform_(conv.bias, -bound, bound, generator=generator)
-            self.conv = nn.Sequential(*(m for c in convs for m in (c, nn.ReLU())), nn.Flatten())
+            # In place: a second copy of every layer's output would not fit the cache.
+            layers = (m for c in convs for m in (c, nn.ReLU(inplace=True)))
+            self.conv = nn.Sequential(*layers, nn.Flatten())
+            self.conv.to(memory_format=torch.channels_last)
             self.project = layer_init(nn.Linear(32 * 3 * 3, H), root2, generator)
             return
         # The first layers of both nets read the same state, so they are one matrix of width 2H,
@@ -378,7 +405,7 @@ class StateEncoder(nn.Module):
     def forward(self, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """State (B, ...) -> policy code (B, H) and critic code (B, H)."""
         if self.is_image:
-            code = F.relu(self.project(self.conv(state / 255.0)))
+            code = F.relu(self.project(self.convolve(state)))
             return code, code
         if self.num_ids:
             cells = torch.arange(state.shape[1], device=state.device) * self.num_ids
@@ -387,6 +414,17 @@ class StateEncoder(nn.Module):
             first = torch.addmm(self.first_bias, state, self.first)  # (B, inputs) -> (B, 2H)
         actor, critic = torch.tanh(first).chunk(2, dim=1)  # 2 x (B, H)
         return torch.tanh(self.actor_hidden(actor)), torch.tanh(self.critic_hidden(critic))
+
+    def convolve(self, state: torch.Tensor) -> torch.Tensor:
+        """Frames (B, 84, 84, C) uint8, see Preprocess -> features (B, 32 * 3 * 3) float32."""
+        device, first = state.device, self.conv[0]
+        bf16 = fast_bf16(device) if self.bf16 is None else self.bf16
+        x = state.to(torch.bfloat16 if bf16 else torch.float32)  # 0 ... 255: exact in both
+        x = x.permute(0, 3, 1, 2)  # (B, C, 84, 84) for PyTorch; in memory channels are still last
+        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+            # The division of the pixels by 255 moves into the weights, which are far fewer.
+            x = F.conv2d(x, first.weight / 255, first.bias, first.stride, first.padding)
+            return self.conv[1:](x).float()
 
 
 class FactorisedUtility(torch.autograd.Function):
@@ -780,7 +818,8 @@ class Preprocess:
 
     Vector states: numbers are normalised by running statistics, which stand still at evaluation;
     with `one_hot`, integer ids are renumbered 0, 1, 2, ... (Grid World uses 6 of the ids 0..11), so
-    that the one-hot vectors hold no entry that never occurs. Image states stay uint8.
+    that the one-hot vectors hold no entry that never occurs. Image states stay uint8; they become
+    (N, 84, 84, C), the order the convolutions read, once here instead of in every epoch.
     `space` describes the result; `first_states` (N, ...) shows which ids there are.
     """
 
@@ -803,7 +842,7 @@ class Preprocess:
         if self.one_hot:
             return torch.from_numpy(self.number[state])
         if self.is_image:
-            return torch.as_tensor(state)
+            return torch.as_tensor(state).permute(0, 2, 3, 1).contiguous()  # (N, 84, 84, C)
         x = self.stats.normalize(state) if self.normalizes else state.astype(np.float32)
         return torch.from_numpy(x).clone()  # into aligned memory, see Agent
 
@@ -816,6 +855,34 @@ class Preprocess:
         self.stats.load({k: v for k, v in state.items() if k != "ids"})
         if self.one_hot:
             self.set_ids(state["ids"].numpy())
+
+
+# ---- several processes: `torchrun --nproc_per_node=N ppo_actiongen.py ...` ----
+#
+# Every process (rank) holds the same agent, plays num_envs / N environments and learns from its own
+# part of each minibatch. What must be equal everywhere (gradients, running statistics, scores) is
+# exchanged by the two functions below; files and screen belong to rank 0.
+
+
+def gathered(x) -> list:
+    """Everyone's `x`, in the order of the ranks (one process: only its own); all ranks wait."""
+    if WORLD_SIZE == 1:
+        return [x]
+    everyone = [None] * WORLD_SIZE
+    dist.all_gather_object(everyone, x)
+    return everyone
+
+
+def average_gradients(parameters) -> None:
+    """Replace every gradient by its mean over the ranks: one message for all of them."""
+    if WORLD_SIZE == 1:
+        return
+    grads = [p.grad for p in parameters if p.grad is not None]
+    flat = torch.cat([g.flatten() for g in grads])
+    dist.all_reduce(flat)
+    means = (flat / WORLD_SIZE).split([g.numel() for g in grads])
+    for grad, mean in zip(grads, means, strict=True):
+        grad.copy_(mean.view_as(grad))
 
 
 # ---- Algorithm 1: rollout, advantages, update ----
@@ -887,7 +954,7 @@ class RewardScale:
         for t in range(len(rewards)):
             returns[t] = self.G = self.gamma * self.G + rewards[t]
             self.G = self.G * (1.0 - dones[t])
-        self.stats.update(returns.reshape(-1))
+        self.stats.update(np.concatenate(gathered(returns.reshape(-1))))
         return (rewards / np.sqrt(self.stats.var + 1e-8)).clip(-10, 10)
 
 
@@ -920,24 +987,40 @@ def update(agent, optimizer, batch, ent_coef, args: Args, generator, device):
     b = {k: v.flatten(0, 1).to(device) for k, v in batch.items() if k not in skip}  # (T*N, ...)
     b["available"] = row[b["available"]]  # (T*N, K): global ids -> rows of project_actions(ids)
     # Normalised once over the whole rollout: every epoch sees the same values (published code).
+    # Under torchrun all processes together make one rollout and one minibatch: with shares of equal
+    # size, the mean of their gradients is the gradient of the whole.
     adv = b["advantage"]
-    b["advantage"] = (adv - adv.mean()) / (adv.std() + 1e-5)
+    joint = torch.cat(gathered(adv.cpu()))
+    b["advantage"] = (adv - joint.mean()) / (joint.std() + 1e-5)
     size = len(adv) // args.num_minibatches
+    micro = args.micro_batch or size
     totals: dict[str, torch.Tensor] = {}
     for _ in range(args.update_epochs):
         permutation = torch.randperm(len(adv), generator=generator, device=device)
         for start in range(0, size * args.num_minibatches, size):  # a rest is dropped
-            mb_inds = permutation[start : start + size]
-            mb = {k: v[mb_inds] for k, v in b.items()}
-            # The parameters changed, so the table is projected again: (n, W), cheap.
-            loss, parts = ppo_loss(agent, mb, agent.project_actions(ids), ent_coef, args)
             optimizer.zero_grad()
-            loss.backward()
+            # The parameters changed, so the table is projected again: (n, W), cheap. Its gradient
+            # is collected in a leaf and goes through the projection once, after all micro-batches.
+            P = agent.project_actions(ids)
+            leaf = P.detach().requires_grad_() if P is not None and P.requires_grad else P
+            for mb_inds in permutation[start : start + size].split(micro):
+                # index_select copies whole rows, ten times as fast for frames as v[mb_inds]
+                mb = {k: v.index_select(0, mb_inds) for k, v in b.items()}
+                loss, parts = ppo_loss(agent, mb, leaf, ent_coef, args)
+                share = len(mb_inds) / size  # means of micro-batches -> mean of the minibatch
+                (loss * share).backward()
+                for key, part in parts.items():
+                    totals[key] = totals.get(key, 0) + part * share
+            if leaf is not P:
+                P.backward(leaf.grad)
+            average_gradients(agent.parameters())
             nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
             optimizer.step()
-            for key, part in parts.items():
-                totals[key] = totals.get(key, 0) + part
-    return {k: v.item() / (args.update_epochs * args.num_minibatches) for k, v in totals.items()}
+    count = args.update_epochs * args.num_minibatches
+    return {
+        k: sum(gathered(v.item() / count)) / WORLD_SIZE if WORLD_SIZE > 1 else v.item() / count
+        for k, v in totals.items()
+    }
 
 
 # ---- Algorithm 2: acting with new actions ----
@@ -954,6 +1037,9 @@ def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=
     module = importlib.import_module(MODULES[args.env])
     num_available = num_available or args.eval_available or args.num_available
     num_envs = min(episodes, 40 if episodes >= 1000 else 32)  # published: 40 x 125, 32 x 20
+    num_envs = -(-num_envs // WORLD_SIZE)  # torchrun: each process plays its part
+    episodes = episodes // WORLD_SIZE + (RANK < episodes % WORLD_SIZE)
+    seed += RANK * num_envs  # environment i of them all starts from seed + i
     quota = np.full(num_envs, episodes // num_envs)
     quota[: episodes % num_envs] += 1
     device = agent.table.device
@@ -973,6 +1059,7 @@ def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=
             results.append((final[module.METRIC][i], episode["r"][i], episode["l"][i]))
         played += done
     envs.close()
+    results = [r for part in gathered(results) for r in part]
     score, returns, lengths = np.array(results, dtype=np.float64).T  # each (episodes,)
     return {
         "score": score.mean(),
@@ -992,7 +1079,9 @@ COLUMNS = (
 
 
 def write_atomically(path: Path, write) -> None:
-    """Call write(temporary path) and rename: a reader never sees half a file."""
+    """Call write(temporary path) and rename: a reader never sees half a file (rank 0 only)."""
+    if RANK:
+        return
     temporary = path.with_name(f".{os.getpid()}-{path.name}")
     try:
         write(temporary)
@@ -1059,7 +1148,7 @@ def save_checkpoint(path: Path, agent, optimizer, generator, preprocess, scale, 
     state = {
         "agent": agent.state_dict(),
         "optimizer": optimizer.state_dict(),
-        "generator": generator.get_state(),
+        "generator": torch.stack(gathered(generator.get_state())),  # (ranks, bytes)
         "preprocess": preprocess.state(),
         "reward_stats": scale.stats.state(),
     }
@@ -1092,7 +1181,7 @@ class MetricsFile:
             rows = [r for r in rows if int(r.split(",")[0]) <= last_step]
         text = "\n".join([",".join(COLUMNS), *rows]) + "\n"
         write_atomically(path, lambda temporary: temporary.write_text(text))
-        self.file = path.open("a")
+        self.file = open(os.devnull, "a") if RANK else path.open("a")
 
     def write(self, row: dict) -> None:
         """Append one row; a missing or not-a-number value is an empty cell."""
@@ -1192,6 +1281,13 @@ def check(args: Args) -> None:
             f"minibatch_size {args.minibatch_size} x num_minibatches {args.num_minibatches} is not "
             f"a multiple of num_envs {args.num_envs}"
         )
+    if args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
+        raise ValueError(
+            f"num_envs {args.num_envs} and minibatch_size {args.minibatch_size} must be multiples "
+            f"of torchrun's {WORLD_SIZE} processes"
+        )
+    if args.micro_batch < 0:
+        raise ValueError(f"micro_batch {args.micro_batch} is not allowed; at least 0")
     if args.ent_coef < 0 or args.learning_rate <= 0:
         raise ValueError("ent_coef must be at least 0 and learning_rate above 0")
     if args.task is not None and "task" not in TASK_OPTIONS[args.env]:
@@ -1232,8 +1328,10 @@ def open_run(args: Args, device) -> tuple[Path, dict | None]:
                 raise ValueError(
                     f"cannot resume {folder}: {f.name} is {theirs!r} there, {ours!r} here"
                 )
+        if (ranks := checkpoint["generator"].shape[0]) != WORLD_SIZE:
+            raise ValueError(f"cannot resume {folder}: {ranks} processes there, {WORLD_SIZE} here")
         return folder, checkpoint
-    if folder.exists() and any(folder.iterdir()) and not args.resume:
+    if folder.exists() and any(folder.iterdir()) and not args.resume and not RANK:
         if not args.overwrite:
             raise ValueError(
                 f"{folder} already holds a run; --resume goes on with it, --overwrite replaces it"
@@ -1263,6 +1361,9 @@ class Run:
         self.device = torch.device(
             ("cuda" if has_cuda else "cpu") if args.device == "auto" else args.device
         )
+        if WORLD_SIZE > 1 and self.device.type == "cuda":  # one GPU for each process
+            self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(self.device)
         self.pools, self.pool, self.num_available = action_pools(args)
         self.batch_size = args.minibatch_size * args.num_minibatches  # T * N
         self.num_steps = self.batch_size // args.num_envs  # T
@@ -1273,21 +1374,42 @@ class Run:
                 f"{self.batch_size} (minibatch_size x num_minibatches)"
             )
         self.phases = ("train",) if args.adapt else ("train", "valid", "test")
-        self.folder, checkpoint = open_run(args, self.device)
-        self.envs = make_envs(args, self.pool, args.num_envs, self.num_available, seeds(args, 1, 0))
+        self.num_envs = args.num_envs // WORLD_SIZE  # of this process
+        # Rank 0 first: the others find the folder and the representation that it makes.
+        for turn in (0, 1):
+            problem = None
+            if turn == min(RANK, 1):
+                try:
+                    self.folder, checkpoint = open_run(args, self.device)
+                    table = load_table(args, self.pools["train"])
+                except (ValueError, FileNotFoundError) as e:
+                    problem = e
+            for e in filter(None, gathered(problem)):  # then all of them stop
+                self.leave_nothing()
+                raise e
+        self.envs = make_envs(
+            args, self.pool, self.num_envs, self.num_available, seeds(args, 1, 0, RANK)
+        )
         try:
-            self.build(load_table(args, self.pools["train"]), checkpoint)
+            self.build(table, checkpoint)
         except (ValueError, FileNotFoundError):
-            if not any(self.folder.iterdir()):
-                self.folder.rmdir()  # a refused run leaves nothing
+            self.leave_nothing()
             raise
+
+    def leave_nothing(self) -> None:
+        """Remove the folder of a refused run if nothing is in it yet."""
+        folder = run_path(self.args)
+        if not RANK and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
     def build(self, table, checkpoint) -> None:
         """Create (or restore) everything that learns."""
         args = self.args
         spaces = self.envs.single_observation_space, self.envs.single_action_space
         torch.set_num_threads(args.threads)
-        first_states = self.envs.reset(seed=seeds(args, 1, 0))[0]["state"]
+        first_states = self.envs.reset(seed=seeds(args, 1, 0, RANK))[0]["state"]
+        if args.one_hot:  # the same ids on all ranks, or their networks would differ
+            first_states = np.concatenate(gathered(first_states))
         self.preprocess = Preprocess(spaces[0]["state"], args, first_states)
         parts = self.preprocess.space, spaces[1], table, self.pool, args, Workers(args.threads)
         self.agent = Agent(*parts).to(self.device)
@@ -1303,15 +1425,15 @@ class Run:
             weight_decay=0.0,  # AdamW without decay is Adam
             fused=True,
         )
-        self.generator = torch.Generator(self.device).manual_seed(seeds(args, 2))
-        self.scale = RewardScale(args.num_envs, args.gamma)
+        self.generator = torch.Generator(self.device).manual_seed(seeds(args, 2, RANK))
+        self.scale = RewardScale(self.num_envs, args.gamma)
         self.update_index, self.seconds, self.best_score = 0, 0.0, -math.inf
         if args.finetune and not checkpoint:
             self.start_from(Path(args.finetune))
         if checkpoint:
             self.agent.load_state_dict(checkpoint["agent"])
             self.optimizer.load_state_dict(checkpoint["optimizer"])
-            self.generator.set_state(checkpoint["generator"].cpu())
+            self.generator.set_state(checkpoint["generator"][RANK].cpu())
             self.preprocess.load(checkpoint["preprocess"])
             self.scale.stats.load(checkpoint["reward_stats"])
             self.update_index = checkpoint["update_index"]
@@ -1372,21 +1494,21 @@ def train(args: Args) -> dict:
     )
     metrics = MetricsFile(run.folder / "metrics.csv", run.update_index * run.batch_size)
     writer = None
-    if args.tensorboard:
+    if args.tensorboard and not RANK:
         from torch.utils.tensorboard import SummaryWriter  # 1.5 s of import, so only here
 
         writer = SummaryWriter(run.folder, purge_step=run.update_index * run.batch_size)
     eval_every = max(1, args.eval_every // run.batch_size)  # in updates
     lr_updates = (args.lr_decay_steps or args.total_timesteps) // run.batch_size
     # Episodes start afresh at every checkpoint, killed or not, so a resumed run repeats exactly.
-    obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index))
+    obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index, RANK))
     bar = tqdm(
         total=run.num_updates * run.batch_size,
         initial=run.update_index * run.batch_size,
         unit="step",
         unit_scale=True,
         desc=run.folder.name,
-        disable=None,  # silent when not a terminal
+        disable=True if RANK else None,  # None: silent when not a terminal
     )
     start = time.perf_counter() - run.seconds
     while run.update_index < run.num_updates:
@@ -1418,11 +1540,13 @@ def train(args: Args) -> dict:
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
         losses = update(run.agent, run.optimizer, batch, ent_coef, args, run.generator, run.device)
         if run.preprocess.normalizes and not args.finetune:
-            run.preprocess.stats.update(batch["raw"].flatten(0, 1).numpy())  # (T*N, ...)
+            raw = batch["raw"].flatten(0, 1).numpy()  # (T*N, ...)
+            run.preprocess.stats.update(np.concatenate(gathered(raw)))
         run.update_index += 1
         step = run.update_index * run.batch_size
         bar.update(run.batch_size)
 
+        episodes = [e for part in gathered(episodes) for e in part]
         scores, returns, lengths = (
             np.array(episodes, float).T if episodes else np.full((3, 1), np.nan)
         )
@@ -1443,7 +1567,7 @@ def train(args: Args) -> dict:
             selection_score = row[f"{run.phases[:2][-1]}_score"]
             line = {phase: f"{row[f'{phase}_score']:.3f}" for phase in run.phases[:2]}
             bar.set_postfix(line)
-            if bar.disable:  # in a file or a notebook: one plain line per evaluation
+            if bar.disable and not RANK:  # in a file or a notebook: one plain line per evaluation
                 print(f"step {step:,}: {', '.join(map(' '.join, line.items()))}", flush=True)
         row["seconds"] = run.seconds = time.perf_counter() - start
         metrics.write(row)
@@ -1455,7 +1579,7 @@ def train(args: Args) -> dict:
                 run.best_score = selection_score
                 run.save("best.pt")
             run.save("checkpoint.pt")
-            obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index))
+            obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index, RANK))
             run.scale.G[:] = 0.0
     bar.close()
     run.envs.close()
@@ -1467,6 +1591,7 @@ def train(args: Args) -> dict:
 def finish(run: Run) -> dict:
     """Load the best checkpoint by validation score and test it once on the unseen actions."""
     args, folder = run.args, run.folder
+    gathered(None)  # rank 0 has written best.pt
     best = load_checkpoint(folder / "best.pt", run.device)
     run.agent.load_state_dict(best["agent"])
     run.preprocess.load(best["preprocess"])
@@ -1474,6 +1599,9 @@ def finish(run: Run) -> dict:
         phase: run.score(phase, args.eval_episodes, seeds(args, 4, k))
         for k, phase in enumerate(run.phases)
     }
+    if RANK:
+        return results
+    launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
     seen, unseen = CEILINGS.get(experiment_name(args), (None, None))
     results |= {
         "metric": run.module.METRIC,
@@ -1484,7 +1612,7 @@ def finish(run: Run) -> dict:
         "best_step": best["update_index"] * run.batch_size,
         "hours": run.seconds / 3600,
         "seed": args.seed,
-        "command": "python " + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": f"{launcher} {' '.join([Path(sys.argv[0]).name, *sys.argv[1:]])}",
     }
     write_atomically(folder / "results.json", lambda t: t.write_text(json.dumps(results, indent=1)))
     plot_curve(
@@ -1640,10 +1768,18 @@ def main() -> None:
         words = [w for a in argv for w in a.split("=")]
         recipe = words[words.index("--recipe") + 1] if "--recipe" in words[:-1] else "fast"
         default = default_args(argv[0], recipe, "--quick" in words)
+        if WORLD_SIZE > 1:
+            default = replace(default, threads=1)
+            # The others may wait for hours while rank 0 trains an encoder.
+            backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+            dist.init_process_group(backend, timeout=timedelta(days=3))
         args = tyro.cli(Args, args=argv[1:], default=default)
         train(replace(args, adapt=args.adapt or args.finetune is not None))
     except (ValueError, FileNotFoundError) as e:
-        raise SystemExit(f"error: {e}") from None
+        raise SystemExit(1 if RANK else f"error: {e}") from None
+    finally:
+        if dist.is_initialized():
+            dist.destroy_process_group()
 
 
 if __name__ == "__main__":
