@@ -1,13 +1,20 @@
-"""The paper's experiments as lists of commands: print them, run what is missing, collect scores.
+"""Every figure and analysis of the appendix as a list of commands: print, run what is missing.
 
-    python benchmarks/paper.py --dry-run gridworld            # the commands and their hours
+    python benchmarks/paper.py --dry-run all                  # every command and its hours
     python benchmarks/paper.py gridworld --jobs 2             # run them, two at a time
-    python benchmarks/paper.py gridworld --budget 0.1 --seeds 0 1 2
+    python benchmarks/paper.py fig8 --budget 0.1 --seeds 0 1 2
     python benchmarks/paper.py gridworld --methods ours engineered
 
-Finished runs are skipped, killed ones go on from their checkpoint. After every run its scores are
-written to results/<env>.csv (one row per phase, with the command that made it) and its learning
-curve to results/<env>_curves.csv; benchmarks/report.py draws both.
+Three kinds of commands: hvae.py trains an encoder, ppo_actiongen.py trains a policy, and
+`ppo_actiongen.py evaluate` tests a finished policy with other sets of actions. A run is named after
+what it is, so figures that show the same run share it. What is finished is skipped, what was killed
+goes on from its checkpoint. Scores are written after every command, each row with its command, and
+benchmarks/report.py draws them:
+
+    results/<environment>.csv, _curves.csv    runs and their learning curves
+    results/<experiment>.csv                  evaluations (analyses, fig9, fig12), t-SNE (fig4-6)
+    results/fig9_curves.csv                   scores during fine-tuning
+    results/encoders.csv                      what the encoders' tables tell (fig4-6)
 """
 
 import csv
@@ -15,19 +22,59 @@ import json
 import shlex
 import subprocess
 import sys
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 
+import numpy as np
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+import hvae  # noqa: E402
 import ppo_actiongen  # noqa: E402
 
-# One experiment = the methods of one published figure; names as in published_results.csv.
-EXPERIMENTS: dict[str, dict[str, str]] = {
+# ---- every run: environment -> method -> command ----
+# Names of methods as in results/published_results.csv, so that the tables join. `--budget` is a
+# method's own factor on its number of steps; {method} stands for the folder of that run.
+
+BASELINES = {  # the methods of every comparison (main paper, Figures 8 and 12)
+    "ours": "",
+    "non_hierarchical_vae": "--representation vae",
+    "ours_no_entropy": "--ent-coef 0",
+    "ours_no_subsampling": "--no-subsample",
+    "nearest_neighbor": "--method nearest-neighbor",
+    "continuous_output": "--method continuous",
+}
+ORACLE = {"oracle_encoder_all_actions": "--representation hvae-all"}
+ENGINEERED = {"engineered": "--representation engineered"}
+VARIANTS = {  # of CREATE
+    "ours_video": "--modality video",
+    "ours_no_subgoal_reward": "--no-subgoal-reward",  # C.3
+    "ours_conditioned_auxiliary": "--aux-conditioned",  # C.4
+    "ours_full_split": "--split full",  # Table 1
+    # A.3: one policy and "an oracle encoder over the entire action set" for all three analyses
+    "ours_analysis": "--split analysis --representation hvae-all",
+}
+ADAPT = {  # C.2: learn on the unseen actions themselves, all of them on offer
+    "ours_from_scratch": "--adapt",
+    "ours_finetuned": "--finetune {ours}",
+    "discrete_from_scratch": "--method nearest-neighbor --adapt",
+    "discrete_finetuned": "--method nearest-neighbor --finetune {nearest_neighbor}",
+}
+MAIN_TASKS = "push obstacle seesaw".split()  # CREATE in the main paper
+MORE_TASKS = "navigate cannon ladder belt buckets basket collide moving funnel".split()  # Figure 8
+
+
+def commands(start: str, *methods: dict[str, str], end: str = "") -> dict[str, str]:
+    """method -> command line: `start`, the method's flags, `end`."""
+    flags = {name: text for group in methods for name, text in group.items()}
+    return {name: " ".join(filter(None, [start, text, end])) for name, text in flags.items()}
+
+
+RUNS: dict[str, dict[str, str]] = {
     "gridworld": {
         "ours": "gridworld",
         "engineered": "gridworld --representation engineered",
@@ -40,6 +87,8 @@ EXPERIMENTS: dict[str, dict[str, str]] = {
         "nearest_neighbor": "gridworld --method nearest-neighbor",
         "continuous_output": "gridworld --method continuous",
         "ours_mlp_encoder": "gridworld --hvae-recipe quick",  # beyond the paper
+        # published code: 1e7 of 4e7 steps
+        **commands("gridworld", ADAPT, end="--budget 0.25"),
     },
     # What each difference of the fast recipe is worth: the recipe, then one difference undone.
     "gridworld-recipe": {
@@ -60,9 +109,184 @@ EXPERIMENTS: dict[str, dict[str, str]] = {
         "continuous_output": "recsys --utility mlp --method continuous",
         "ours_bilinear": "recsys",  # beyond the paper, the fast recipe's default
     },
+    "stacking": commands("stacking", BASELINES, ORACLE, ENGINEERED, ADAPT)
+    | {
+        "ours_no_place": "stacking --placement none",  # C.6
+        "ours_2d_place": "stacking --placement 2d",
+        "ours_full_split": "stacking --split full",  # Table 2
+    },
 }
-EXPERIMENTS["recsys-full"] = {
-    method: f"{command} --fully-observable" for method, command in EXPERIMENTS["recsys"].items()
+RUNS["recsys-full"] = {
+    method: f"{command} --fully-observable" for method, command in RUNS["recsys"].items()
+}
+# ours: two thousand products on offer in every step cost twenty times the usual hundred
+RUNS["recsys"] |= commands("recsys --utility mlp", ADAPT, end="--budget 0.1")
+for task in MAIN_TASKS + MORE_TASKS:
+    RUNS[f"create-{task}"] = commands(f"create --task {task}", BASELINES)
+for task in MAIN_TASKS:
+    RUNS[f"create-{task}"] |= commands(f"create --task {task}", ORACLE, VARIANTS)
+    # 6e6 steps; published: drawn to 5.5e6
+    RUNS[f"create-{task}"] |= commands(f"create --task {task}", ADAPT, end="--budget 0.1")
+RUNS["create-seesaw"] |= commands("create --task seesaw", ENGINEERED)  # published here only
+
+
+# ---- every figure and analysis: the runs it shows, and what they are tested with ----
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One figure, table or analysis of the paper."""
+
+    shows: str
+    """What it is; the report's heading."""
+    runs: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Environment -> methods, keys of RUNS."""
+    tests: tuple[str, ...] = ()
+    """Options of `ppo_actiongen.py evaluate`; {pool} is the number of test actions."""
+    tested: tuple[str, ...] = ()
+    """Only these methods are tested so (default: all)."""
+    encoders: dict[str, str] = field(default_factory=dict)
+    """Panel of a t-SNE picture -> options of hvae.py, or "<environment> engineered"."""
+
+
+def methods_of(environment: str, *, beyond: bool = True) -> tuple[str, ...]:
+    """The methods of an environment's main comparison: all but variants and adaptation."""
+    omit = set(ADAPT) | set(VARIANTS) - {"ours_video"} | {"ours_no_place", "ours_2d_place"}
+    omit |= set() if beyond else {"ours_mlp_encoder", "ours_bilinear"}
+    return tuple(m for m in RUNS[environment] if m not in omit)
+
+
+def main_tasks(*methods: str) -> dict[str, tuple[str, ...]]:
+    """The same methods on the three CREATE tasks of the main paper."""
+    return {f"create-{task}": methods for task in MAIN_TASKS}
+
+
+MAIN = ["gridworld", "recsys", *(f"create-{task}" for task in MAIN_TASKS), "stacking"]
+TITLES = {
+    "gridworld": "Grid World",
+    "gridworld-recipe": "Grid World: what each difference of the fast recipe is worth",
+    "recsys": "Recommender, partially observable",
+    "recsys-full": "Recommender, fully observable",
+    **{f"create-{task}": f"CREATE {task}" for task in MAIN_TASKS + MORE_TASKS},
+    "stacking": "Shape Stacking",
+}
+EVALUATE = "--actions test --episodes 5000"  # as the final test of every run
+ANALYSIS = f"{EVALUATE} --num-available 50"  # Table 3
+
+EXPERIMENTS: dict[str, Experiment] = {
+    name: Experiment(TITLES[name], {name: methods_of(name)})
+    for name in ("gridworld", "gridworld-recipe", "recsys", "recsys-full", *MAIN[2:])
+}
+EXPERIMENTS |= {
+    "table-main": Experiment(
+        "Main results: all methods on all environments",
+        {name: methods_of(name, beyond=False) for name in MAIN},
+    ),
+    "table-full-split": Experiment(
+        "CREATE with tools of unseen classes (Table 1)", main_tasks("ours", "ours_full_split")
+    ),
+    "fig4": Experiment(
+        "Figure 4: representations of unseen skills, Grid World",
+        encoders={
+            "(x, y) trajectories": "gridworld",
+            "VAE": "gridworld --no-hierarchical",
+            "one-hot": "gridworld --modality onehot",
+            "engineered": "gridworld engineered",
+        },
+    ),
+    "fig5": Experiment(
+        "Figure 5: representations of unseen tools, CREATE",
+        encoders={
+            "(x, y) trajectories": "create",
+            "VAE": "create --no-hierarchical",
+            "video": "create --modality video",
+            "Full Split": "create --split full",
+        },
+    ),
+    "fig6": Experiment(
+        "Figure 6: representations of unseen shapes, Shape Stacking",
+        encoders={
+            "viewpoints": "stacking",
+            "VAE": "stacking --no-hierarchical",
+            "Full Split": "stacking --split full",
+        },
+    ),
+    "fig8": Experiment(
+        "Figure 8: the other nine CREATE tasks",
+        {f"create-{task}": tuple(BASELINES) for task in MORE_TASKS},
+    ),
+    "fig9": Experiment(
+        "Figure 9: learning on the unseen actions instead of zero-shot",
+        {
+            name: ("ours", "nearest_neighbor", *ADAPT)
+            for name in ("create-obstacle", "create-seesaw", "stacking", "gridworld", "recsys")
+        },
+        tests=("--actions test --episodes 5000 --num-available {pool}",),  # the zero-shot line
+        tested=("ours",),
+    ),
+    "fig10": Experiment(
+        "Figure 10: CREATE without subgoal rewards", main_tasks("ours", "ours_no_subgoal_reward")
+    ),
+    "fig11": Experiment(
+        "Figure 11: the auxiliary policy also sees the chosen action",
+        main_tasks("ours", "ours_conditioned_auxiliary"),
+    ),
+    "fig12": Experiment(
+        "Figure 12: fully observable Recommender",
+        {"recsys-full": methods_of("recsys-full")},
+        # 500: Table 3; 25: published code in this variant; 50: its validation
+        tests=tuple(f"{EVALUATE} --num-available {K}" for K in (25, 50, 500)),
+    ),
+    "fig13": Experiment(
+        "Figure 13: Shape Stacking, where shapes are placed, and unseen classes (Table 2)",
+        {"stacking": ("ours_no_place", "ours", "ours_2d_place", "ours_full_split")},
+    ),
+    "fig14": Experiment(
+        "Figure 14: learning curves",
+        {name: methods_of(name, beyond=False) for name in MAIN},
+    ),
+    "analysis-angle": Experiment(
+        "Analysis: tools at least so many degrees from every training tool of their class",
+        main_tasks("ours_analysis"),
+        tests=tuple(f"{ANALYSIS} --min-angle-gap {gap}" for gap in (15, 12, 9, 6, 3)),
+    ),
+    # Published: absolute squared distances 0.5 .. 5, which depend on the scale of one encoder's
+    # table. Here: quantiles of the unseen tools' squared distance to the nearest training tool.
+    "analysis-embedding": Experiment(
+        "Analysis: tools whose representation is far from those of all training tools",
+        main_tasks("ours_analysis"),
+        tests=tuple(f"{ANALYSIS} --min-embedding-distance q0.{q}" for q in range(10)),
+    ),
+    "analysis-unseen-ratio": Experiment(
+        "Analysis: share of unseen tools among those on offer",
+        main_tasks("ours_analysis"),
+        tests=tuple(f"{ANALYSIS} --unseen-ratio {r / 5}" for r in range(6)),
+    ),
+    "analysis-set-size": Experiment(
+        "Analysis: number of tools on offer",
+        main_tasks("ours", "ours_no_entropy", "ours_no_subsampling"),
+        tests=tuple(  # 1,000 episodes: published code
+            f"--actions test --episodes 1000 --num-available {K}" for K in range(10, 61, 5)
+        ),
+    ),
+}
+
+# ---- what things cost, for --dry-run ----
+
+RATES = {  # environment steps per second of one run on one core: benchmarks/throughput.py
+    "gridworld": 15_000,
+    "recsys": 4_600,
+    "create": 900,
+    "stacking": 100,
+}
+EPISODE = {"gridworld": 10, "recsys": 100, "create": 30, "stacking": 10}  # steps at most, Table 3
+TEST_ACTIONS = {"gridworld": 256, "recsys": 2500, "create": 507, "stacking": 203}  # 2:1:1, A
+ENCODER_HOURS = {  # recipe laptop, one core, recording included
+    ("gridworld", "xy"): 0.05,
+    ("gridworld", "onehot"): 0.1,
+    ("create", "xy"): 0.5,
+    ("create", "video"): 2.0,
+    ("stacking", "image"): 1.0,
 }
 
 COLUMNS = (
@@ -70,6 +294,14 @@ COLUMNS = (
     "published hours command"
 ).split()
 CURVE_COLUMNS = "env task method seed step train_score valid_score".split()
+ADAPT_COLUMNS = "env task method seed step episode_score".split()
+OPTIONS = (  # what an evaluation is known by
+    "actions num_available min_angle_gap min_embedding_distance unseen_ratio greedy episodes"
+).split()
+TEST_COLUMNS = [*"env task method seed steps".split(), *OPTIONS]
+TEST_COLUMNS += "pool_size score stderr return length command".split()
+ENCODER_COLUMNS = "figure panel env score value published command".split()
+POINT_COLUMNS = "panel action label x y".split()
 
 
 @dataclass
@@ -86,31 +318,70 @@ class Args:
     """Factor on each preset's number of environment steps; the rows name the steps really run."""
     recipe: str = "fast"
     """fast or paper, see ppo_actiongen.py."""
+    hvae_recipe: str = "laptop"
+    """laptop, quick or paper, see hvae.py."""
     extra: str = ""
-    """Further flags for every command, as one string."""
+    """Further flags for every training command, as in --extra="--eval-episodes 100"."""
+    extra_encoder: str = ""
+    """Further flags for every hvae.py command of fig4 to fig6."""
+    extra_test: str = ""
+    """Further flags for every evaluation."""
     jobs: int = 1
     """How many runs at a time, one thread each."""
     dry_run: bool = False
     """Only print the commands and their estimated hours."""
-    rate: float = 15_000.0
-    """Environment steps per second of one run, for the estimate (benchmarks/throughput.py)."""
+    rate: float | None = None
+    """Environment steps per second of one run, instead of RATES."""
     runs_dir: str = "runs/paper"
     """Where the runs live."""
     results_dir: str = "results"
     """Where the tables go."""
 
 
-@dataclass
-class Job:
-    """One command of one experiment."""
+# ---- from experiments to commands ----
 
-    experiment: str
+
+@dataclass
+class Encoder:
+    """One table of representations: a command of hvae.py."""
+
+    words: list[str]
+    path: Path
+
+    @property
+    def key(self) -> Path:  # the same table by other words is the same table
+        return self.path
+
+    @property
+    def command(self) -> str:
+        return "python hvae.py " + shlex.join(self.words)
+
+    @property
+    def finished(self) -> bool:
+        return self.path.exists()
+
+    @property
+    def hours(self) -> float:
+        modality = self.path.name.split("-")[1]  # <env>-<modality>-...
+        return ENCODER_HOURS[self.words[0], modality]
+
+
+@dataclass
+class Run:
+    """One policy: a command of ppo_actiongen.py."""
+
+    env: str  # key of RUNS
     method: str
     seed: int
     words: list[str]
     steps: int
     folder: Path
-    lock: Lock = field(default_factory=Lock)
+    start: "Run | None" = None  # the run whose policy is fine-tuned
+    rate: float = 1.0
+
+    @property
+    def key(self) -> Path:
+        return self.folder
 
     @property
     def command(self) -> str:
@@ -120,54 +391,200 @@ class Job:
     def finished(self) -> bool:
         return (self.folder / "results.json").exists()
 
+    @property
+    def hours(self) -> float:
+        return self.steps / self.rate / 3600
 
-def jobs_of(args: Args) -> list[Job]:
-    """All commands of the chosen experiments; ValueError for an unknown name."""
+
+@dataclass
+class Test:
+    """One evaluation of a finished run."""
+
+    experiment: str
+    run: Run
+    words: list[str]
+
+    @property
+    def command(self) -> str:
+        return "python ppo_actiongen.py " + shlex.join(self.words)
+
+    key = command
+
+    def row(self) -> dict | None:
+        """The row of the run's evaluations.csv with these options, if there is one."""
+        path = self.run.folder / "evaluations.csv"
+        flags = dict(zip(self.words[2:-1:2], self.words[3::2], strict=False))
+        wanted = {key: flags.get("--" + key.replace("_", "-"), "") for key in OPTIONS}
+        wanted |= {"greedy": "False", "seed": flags.get("--seed", "0")}
+        for row in csv.DictReader(path.open()) if path.exists() else ():
+            if all(equal(row[key], value) for key, value in wanted.items()):
+                return row
+        return None
+
+    @property
+    def finished(self) -> bool:
+        return self.row() is not None
+
+    @property
+    def hours(self) -> float:
+        episodes = int(self.words[self.words.index("--episodes") + 1])
+        return episodes * EPISODE[self.run.words[0]] / self.run.rate / 3600
+
+
+def equal(a: str, b: str) -> bool:
+    """Equal as numbers (15 and 15.0), or else as text."""
+    try:
+        return float(a) == float(b)
+    except ValueError:
+        return a == b
+
+
+def make_run(env: str, method: str, seed: int, args: Args) -> Run:
+    """The run of this method; its folder is named after what it is, not after a figure."""
+    words, budget = shlex.split(RUNS[env][method]), args.budget
+    if "--budget" in words:  # this method's own factor on top
+        at = words.index("--budget")
+        budget *= float(words[at + 1])
+        del words[at : at + 2]
+    start = None
+    for i, word in enumerate(words):
+        if word.startswith("{"):
+            start = make_run(env, word.strip("{}"), seed, args)
+            words[i] = str(start.folder)
+    steps = round(ppo_actiongen.default_args(words[0], args.recipe, False).total_timesteps * budget)
+    # ours: every seed has its own split, so that the spread over seeds holds the luck
+    # of the split too (published: one split; ours differ by 0.1 in difficulty).
+    words += ["--seed", str(seed), "--split-seed", str(seed), "--threads", "1"]
+    words += ["--total-timesteps", str(steps), *shlex.split(args.extra)]
+    if args.recipe != "fast":
+        words += ["--recipe", args.recipe]
+    name = f"{env}-{method}-{args.recipe}-{steps}-s{seed}"
+    if args.hvae_recipe != "laptop" and "--hvae-recipe" not in words:
+        words += ["--hvae-recipe", args.hvae_recipe]
+        name += f"-{args.hvae_recipe}"
+    rate = args.rate or RATES[words[0]]
+    return Run(env, method, seed, words, steps, Path(args.runs_dir) / name, start, rate)
+
+
+def make_test(experiment: str, run: Run, options: str, args: Args) -> Test:
+    """The evaluation of a run with these options."""
+    options = options.replace("{pool}", str(TEST_ACTIONS[run.words[0]]))
+    flags = {}  # flag -> value; later ones win
+    for text in (options, args.extra_test):
+        words = shlex.split(text)
+        flags |= dict(zip(words[::2], words[1::2], strict=True))
+    words = [word for pair in flags.items() for word in pair]
+    return Test(experiment, run, ["evaluate", str(run.folder), *words, "--save"])
+
+
+def make_encoder(options: str, split_seed: int, args: Args, extra: str = "") -> Encoder:
+    """The encoder of these options of hvae.py."""
+    words = [*shlex.split(options), "--split-seed", str(split_seed), *shlex.split(extra)]
+    if args.hvae_recipe != "laptop" and "--recipe" not in words:
+        words += ["--recipe", args.hvae_recipe]
+    words += ["--runs-dir", args.runs_dir]
+    return Encoder(words, hvae.representation_path(tyro.cli(hvae.Args, args=words)))
+
+
+def encoder_of(run: Run, args: Args) -> Encoder | None:
+    """The encoder whose table this run needs, as `load_table` of ppo_actiongen.py makes it."""
+    preset = ppo_actiongen.default_args(run.words[0], args.recipe, False)
+    run_args = tyro.cli(ppo_actiongen.Args, args=run.words[1:], default=preset)
+    if run_args.representation not in ("hvae", "hvae-all", "vae"):
+        return None
+    options = [run_args.env]
+    if run_args.modality:
+        options += ["--modality", run_args.modality]
+    options += ["--no-hierarchical"] * (run_args.representation == "vae")
+    options += ["--train-on", "all"] * (run_args.representation == "hvae-all")
+    options += ["--split", run_args.split, "--seed", str(run_args.hvae_seed)]
+    options += ["--recipe", run_args.hvae_recipe]
+    return make_encoder(shlex.join(options), run_args.split_seed, args)
+
+
+@dataclass
+class Plan:
+    """The commands of one experiment, in the order they can run in."""
+
+    name: str
+    panels: dict[str, Encoder | None]  # of a t-SNE picture; None: engineered
+    encoders: list[Encoder]
+    runs: list[Run]
+    tests: list[Test]
+
+    @property
+    def everything(self) -> list:
+        return [*self.encoders, *self.runs, *self.tests]
+
+
+def plan(args: Args) -> list[Plan]:
+    """What each of the chosen experiments consists of; ValueError for an unknown name."""
     names = list(EXPERIMENTS) if args.experiments == ("all",) else args.experiments
-    jobs = []
-    for seed in args.seeds:  # seed by seed, so that an interrupted matrix is still balanced
-        for name in names:
-            if name not in EXPERIMENTS:
-                raise ValueError(f"experiment {name!r} is not one of {', '.join(EXPERIMENTS)}, all")
-            for method in args.methods or EXPERIMENTS[name]:
-                if method not in EXPERIMENTS[name]:
-                    raise ValueError(
-                        f"method {method!r} is not one of {', '.join(EXPERIMENTS[name])}"
-                    )
-                words, budget = shlex.split(EXPERIMENTS[name][method]), args.budget
-                if "--budget" in words:  # this method's own factor on top
-                    at = words.index("--budget")
-                    budget *= float(words[at + 1])
-                    del words[at : at + 2]
-                preset = ppo_actiongen.default_args(words[0], args.recipe, False)
-                steps = round(preset.total_timesteps * budget)
-                # ours: every seed has its own split, so that the spread over seeds holds the luck
-                # of the split too (published: one split; ours differ by 0.1 in difficulty).
-                words += ["--seed", str(seed), "--split-seed", str(seed), "--threads", "1"]
-                words += ["--total-timesteps", str(steps), *shlex.split(args.extra)]
-                if args.recipe != "fast":
-                    words += ["--recipe", args.recipe]
-                folder = Path(args.runs_dir) / f"{name}-{method}-{args.recipe}-{steps}-s{seed}"
-                jobs.append(Job(name, method, seed, words, steps, folder))
-    return jobs
+    plans = []
+    for name in names:
+        if name not in EXPERIMENTS:
+            raise ValueError(f"experiment {name!r} is not one of {', '.join(EXPERIMENTS)}, all")
+        e, runs, tests = EXPERIMENTS[name], {}, []
+        known = list(dict.fromkeys(m for methods in e.runs.values() for m in methods))
+        for method in args.methods if known else ():
+            if method not in known:
+                raise ValueError(f"method {method!r} is not one of {', '.join(known)}")
+        for seed in args.seeds:  # seed by seed, so that an interrupted matrix is still balanced
+            for env, methods in e.runs.items():
+                for method in (m for m in methods if m in (args.methods or known)):
+                    run = make_run(env, method, seed, args)
+                    for each in filter(None, (run.start, run)):  # a fine-tuned run after its start
+                        runs.setdefault(each.folder, each)
+                    if method in (e.tested or known):
+                        tests += [make_test(name, run, options, args) for options in e.tests]
+        panels = {
+            panel: None
+            if options.endswith(" engineered")
+            else make_encoder(options, args.seeds[0], args, args.extra_encoder)
+            for panel, options in e.encoders.items()
+        }
+        needed = [*panels.values(), *(encoder_of(run, args) for run in runs.values())]
+        encoders = {encoder.path: encoder for encoder in needed if encoder}
+        plans.append(Plan(name, panels, list(encoders.values()), list(runs.values()), tests))
+    return plans
 
 
-def rows_of(job: Job) -> tuple[list[dict], list[dict]]:
+# ---- from finished runs to tables ----
+
+
+def identity(run: Run) -> dict:
+    """The columns that say which run a row is of."""
+    run_args = json.loads((run.folder / "args.json").read_text())
+    same = {k: run_args[k] for k in ("task", "representation", "modality", "split", "seed")}
+    return same | {"env": run.env, "method": run.method, "command": run.command}
+
+
+def rows_of(run: Run) -> tuple[list[dict], list[dict]]:
     """The rows of results/<env>.csv and of its learning curve for one finished run."""
-    results = json.loads((job.folder / "results.json").read_text())
-    run_args = json.loads((job.folder / "args.json").read_text())
-    same = {k: run_args[k] for k in ("env", "task", "representation", "modality", "split", "seed")}
-    same |= {"env": job.experiment, "method": job.method, "command": job.command}
+    results = json.loads((run.folder / "results.json").read_text())
+    same = identity(run)
     scores = [
         same
         | {k: results[phase][k] for k in ("score", "stderr", "episodes")}
         | {"phase": phase, "published": results["published"].get(phase)}
         | {"steps": results["steps"], "hours": results["hours"]}
         for phase in ("train", "valid", "test")
+        if phase in results  # adaptation has only the set it adapts to
     ]
-    rows = csv.DictReader((job.folder / "metrics.csv").open())
+    rows = csv.DictReader((run.folder / "metrics.csv").open())
     curve = [same | row for row in rows if row["valid_score"]]
     return scores, curve
+
+
+def adaptation_of(run: Run, points: int = 100) -> list[dict]:
+    """Score during adaptation, averaged over a hundredth of the run each (Figure 9)."""
+    metrics = list(csv.DictReader((run.folder / "metrics.csv").open()))
+    rows = []
+    for part in np.array_split(metrics, min(points, len(metrics))):
+        scores = [float(row["episode_score"]) for row in part if row["episode_score"]]
+        if scores:  # no episode may have ended in so short a time
+            rows.append({"step": part[-1]["step"], "episode_score": float(np.mean(scores))})
+    return [identity(run) | row for row in rows]
 
 
 def merge(path: Path, columns: list[str], rows: list[dict], key: tuple[str, ...]) -> None:
@@ -193,60 +610,173 @@ def merge(path: Path, columns: list[str], rows: list[dict], key: tuple[str, ...]
     ppo_actiongen.write_atomically(path, write)
 
 
-def collect(job: Job, results_dir: Path) -> None:
+def collect_run(run: Run, results_dir: Path) -> None:
     """Write one finished run into the tables."""
-    scores, curve = rows_of(job)
-    name = job.experiment
-    merge(results_dir / f"{name}.csv", COLUMNS, scores, ("method", "seed", "command"))
-    merge(results_dir / f"{name}_curves.csv", CURVE_COLUMNS, curve, ("method", "seed"))
+    scores, curve = rows_of(run)
+    key = ("env", "method", "seed", "command")
+    merge(results_dir / f"{run.env}.csv", COLUMNS, scores, key)
+    if run.method in ADAPT:
+        merge(results_dir / "fig9_curves.csv", ADAPT_COLUMNS, adaptation_of(run), key[:3])
+    else:
+        merge(results_dir / f"{run.env}_curves.csv", CURVE_COLUMNS, curve, key[:3])
 
 
-def run(job: Job, args: Args, lock: Lock) -> bool:
-    """Run one command unless it is finished; True if there is a result in the end."""
-    if not job.finished:
-        job.folder.parent.mkdir(parents=True, exist_ok=True)
-        log = job.folder.with_suffix(".log")
-        flags = ["--runs-dir", args.runs_dir, "--run-name", job.folder.name, "--resume"]
-        flags += ["--no-tensorboard"]
-        with log.open("a") as file:
-            words = [sys.executable, str(ROOT / "ppo_actiongen.py"), *job.words, *flags]
-            subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, check=False)
+def collect_test(test: Test, results_dir: Path) -> None:
+    """Write one evaluation into the table of its experiment."""
+    steps = json.loads((test.run.folder / "results.json").read_text())["steps"]
+    row = test.row() | identity(test.run) | {"steps": steps, "command": test.command}
+    key = ("env", "method", "seed", "steps", *OPTIONS)
+    merge(results_dir / f"{test.experiment}.csv", TEST_COLUMNS, [row], key)
+
+
+def collect_panel(figure: str, panel: str, encoder: Encoder | None, args: Args) -> None:
+    """Probe scores and t-SNE places of one table's held-out actions (Figures 4-6)."""
+    from sklearn.manifold import TSNE
+
+    env = EXPERIMENTS[figure].encoders[panel].split()[0]
+    module = hvae.load_environment(env)
+    seed, split = args.seeds[0], "default"
+    if encoder:
+        options = tyro.cli(hvae.Args, args=encoder.words)
+        split = options.split
+        mean = hvae.load_representation(encoder.path, env, split, options.split_seed)["mean"]
+    else:
+        mean = np.asarray(module.engineered_representations(), np.float32)
+    ids = module.split_actions(split, seed)
+    held_out = np.setdiff1d(np.concatenate([ids["valid"], ids["test"]]), ids["train"])
+    record = {"scores": hvae.probe(mean, ids["train"], held_out, env), "published": {}}
+    if encoder:  # what hvae.py left beside its table
+        record = json.loads(encoder.path.with_suffix(".json").read_text())
+    command = encoder.command if encoder else f"python benchmarks/paper.py {figure}"
+    same = {"figure": figure, "panel": panel, "env": env, "command": command}
+    rows = [
+        same | {"score": name, "value": value, "published": record["published"].get(name)}
+        for name, value in record["scores"].items()
+    ]
+    results_dir = Path(args.results_dir)
+    merge(results_dir / "encoders.csv", ENCODER_COLUMNS, rows, ("figure", "panel"))
+    perplexity = min(hvae.PERPLEXITY, (len(held_out) - 1) / 3)
+    tsne = TSNE(perplexity=perplexity, init="pca", random_state=0)
+    places = tsne.fit_transform(mean[held_out])  # (n, D) -> (n, 2)
+    labels = module.action_labels()
+    points = [
+        {"panel": panel, "action": i, "label": labels[i], "x": round(x, 1), "y": round(y, 1)}
+        for i, (x, y) in zip(held_out.tolist(), places.tolist(), strict=True)
+    ]
+    merge(results_dir / f"{figure}.csv", POINT_COLUMNS, points, ("panel",))
+
+
+# ---- running ----
+
+
+def call(script: str, words: list[str], log: Path) -> None:
+    """Run one script of this repository, its output appended to a log."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a") as file:
+        words = [sys.executable, str(ROOT / script), *words]
+        subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, check=False)
+
+
+def finish(job, log: Path, score) -> bool:
+    """Print a command with its score, or that it failed; True if there is a result."""
+    text = f"{score():7.3f}" if job.finished else " FAILED"
+    print(f"{text}  {job.command}" + ("" if job.finished else f"   (see {log})"), flush=True)
+    return job.finished
+
+
+def train_encoder(encoder: Encoder) -> bool:
+    """Train one encoder unless its table is there."""
+    log = encoder.path.with_suffix(".log")
+    if encoder.finished:
+        return True
+    call("hvae.py", encoder.words, log)
+    record = encoder.path.with_suffix(".json")  # its first probe score stands for the table
+    return finish(
+        encoder, log, lambda: next(iter(json.loads(record.read_text())["scores"].values()))
+    )
+
+
+def train_policy(run: Run, args: Args, lock: Lock) -> bool:
+    """Train one policy unless it is finished, and write its scores into the tables."""
+    log = run.folder.with_suffix(".log")
+    if not run.finished:
+        flags = ["--runs-dir", args.runs_dir, "--run-name", run.folder.name, "--resume"]
+        call("ppo_actiongen.py", [*run.words, *flags, "--no-tensorboard"], log)
     with lock:
-        if not job.finished:
-            print(f"FAILED  {job.command}   (see {job.folder.with_suffix('.log')})", flush=True)
-            return False
-        collect(job, Path(args.results_dir))
-        score = json.loads((job.folder / "results.json").read_text())["test"]["score"]
-        print(f"{score:.3f}  {job.command}", flush=True)
-    return True
+        if run.finished:
+            collect_run(run, Path(args.results_dir))
+        phase = "train" if run.method in ADAPT else "test"
+        results = run.folder / "results.json"
+        return finish(run, log, lambda: json.loads(results.read_text())[phase]["score"])
+
+
+def test_policy(tests: list[Test], args: Args, lock: Lock) -> list[bool]:
+    """The evaluations of one run, one after the other: they share its evaluations.csv."""
+    done = []
+    for test in tests:
+        log = test.run.folder.with_suffix(".log")
+        if not test.finished:
+            call("ppo_actiongen.py", [*test.words], log)
+        with lock:
+            if test.finished:
+                collect_test(test, Path(args.results_dir))
+            done.append(finish(test, log, lambda t=test: float(t.row()["score"])))
+    return done
+
+
+def run_all(plans: list[Plan], args: Args) -> list[bool]:
+    """Encoders, policies, fine-tuned policies, evaluations, pictures: each needs those before."""
+    encoders = {e.path: e for p in plans for e in p.encoders}
+    runs = {run.folder: run for p in plans for run in p.runs}
+    tests = defaultdict(list)
+    for test in (test for p in plans for test in p.tests):
+        tests[test.run.folder].append(test)
+    lock = Lock()
+    with ThreadPoolExecutor(args.jobs) as pool:
+        done = list(pool.map(train_encoder, encoders.values()))
+        for tuned in (False, True):
+            stage = [run for run in runs.values() if bool(run.start) == tuned]
+            stage.sort(key=lambda run: args.seeds.index(run.seed))
+            done += pool.map(lambda run: train_policy(run, args, lock), stage)
+        for some in pool.map(lambda group: test_policy(group, args, lock), tests.values()):
+            done += some
+    for p in plans:
+        for panel, encoder in p.panels.items():
+            if encoder is None or encoder.finished:
+                collect_panel(p.name, panel, encoder, args)
+    return done
+
+
+def show(plans: list[Plan]) -> None:
+    """--dry-run: every command with its hours on one core; shared ones under the first figure."""
+    listed, left, count = set(), 0.0, 0
+    for p in plans:
+        new = [job for job in p.everything if job.key not in listed]
+        listed |= {job.key for job in new}
+        shared = len(p.everything) - len(new)
+        print(f"\n{p.name}: {EXPERIMENTS[p.name].shows}")
+        print(f"    {len(new)} commands" + (f", {shared} more are listed above" * bool(shared)))
+        for job in new:
+            print(f"{'done' if job.finished else f'{job.hours:.2f} h':>8}  {job.command}")
+            left, count = left + (0 if job.finished else job.hours), count + (not job.finished)
+    print(
+        f"\n{count} of {len(listed)} to run, about {left:.1f} hours on one core, "
+        f"{left / 2:.1f} on two (--jobs 2); steps per second: {RATES} (benchmarks/throughput.py)"
+    )
 
 
 def main() -> None:
-    """Print or run the jobs."""
+    """Print or run the commands."""
     args = tyro.cli(Args)
     try:
-        jobs = jobs_of(args)
+        plans = plan(args)
+        if args.dry_run:
+            return show(plans)
+        done = run_all(plans, args)
     except ValueError as e:
         raise SystemExit(f"error: {e}") from None
-    if args.dry_run:
-        for job in jobs:
-            state = "done" if job.finished else f"{job.steps / args.rate / 3600:.2f} h"
-            print(f"{state:>8}  {job.command}")
-        hours = sum(j.steps for j in jobs if not j.finished) / args.rate / 3600 / args.jobs
-        print(f"{sum(not j.finished for j in jobs)} of {len(jobs)} to run, about {hours:.1f} hours")
-        return
-    # Representations are shared between runs, so make each of them once, before the runs start.
-    for words in {tuple(j.words): j.words for j in jobs if not j.finished}.values():
-        preset = ppo_actiongen.default_args(words[0], args.recipe, False)
-        run_args = tyro.cli(ppo_actiongen.Args, args=words[1:], default=preset)
-        run_args.runs_dir = args.runs_dir
-        pools, *_ = ppo_actiongen.action_pools(run_args)
-        ppo_actiongen.load_table(run_args, pools["train"])
-    lock = Lock()
-    with ThreadPoolExecutor(args.jobs) as pool:
-        done = list(pool.map(lambda job: run(job, args, lock), jobs))
     if not all(done):
-        raise SystemExit(f"error: {done.count(False)} of {len(done)} runs failed")
+        raise SystemExit(f"error: {done.count(False)} of {len(done)} commands failed")
 
 
 if __name__ == "__main__":

@@ -3,17 +3,27 @@
     python benchmarks/report.py            # results/*.png and the tables in README.md
     python benchmarks/report.py --check    # exit 1 if README.md disagrees with the CSV files
 
+One picture results/<experiment>.png per figure or analysis of benchmarks/paper.py, and one table
+between the markers of that name in README.md. What has no results yet is left out.
 Bars: our mean over seeds, filled; published mean, outlined; dots: our seeds; line: the ceiling.
 """
 
+import colorsys
 import csv
 import sys
 from collections import defaultdict
 from pathlib import Path
 from statistics import mean, pstdev
 
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+import paper  # noqa: E402
+
 import ppo_actiongen  # noqa: E402
 
 RESULTS = ROOT / "results"
@@ -31,13 +41,32 @@ METHODS = {
     "continuous_output": "Continuous output",
     "ours_mlp_encoder": "Ours, MLP encoder",
     "ours_bilinear": "Ours, bilinear utility",
+    "ours_video": "Ours, video",
+    "ours_no_subgoal_reward": "No subgoal reward",
+    "ours_conditioned_auxiliary": "Conditioned auxiliary policy",
+    "ours_no_place": "No Place",
+    "ours_2d_place": "2D Place",
+    "ours_full_split": "Full Split",
+    "ours_analysis": "Ours, 762 tools",
+    "ours_from_scratch": "Ours, from scratch",
+    "ours_finetuned": "Ours, fine-tuned",
+    "discrete_from_scratch": "Discrete, from scratch",
+    "discrete_finetuned": "Discrete, fine-tuned",
+}
+# What "ours" is called where it stands beside its own variants.
+MAIN_LABELS = {
+    "fig10": "Main",
+    "fig11": "Main",
+    "fig13": "1D Place",
+    "table-full-split": "Default Split",
 }
 TITLES = {
     "gridworld": "Grid World, success rate",
     "recsys": "Recommender, click-through rate (partially observable)",
     "recsys-full": "Recommender, click-through rate (fully observable)",
+    "stacking": "Shape Stacking, height",
 }
-
+BAR_KEY = "filled: this repository (dots: seeds)   outlined: published   line: ceiling"
 
 RECIPES = ("gridworld-recipe",)
 
@@ -75,12 +104,40 @@ def read(path: Path) -> list[dict]:
 
 
 def published(env: str) -> dict[tuple[str, str], tuple[float, float, int]]:
-    """(method, phase) -> published mean, std, number of seeds."""
-    env = env.replace("-", "_")
-    rows = [r for r in read(RESULTS / "published_results.csv") if r["env"] == env]
+    """(method, phase) -> published mean, std, number of seeds; env as in paper.RUNS."""
+    name, _, task = env.partition("-") if env.startswith("create-") else (env, "", "")
+    rows = [
+        r
+        for r in read(RESULTS / "published_results.csv")
+        if (r["env"], r["task"]) == (name.replace("-", "_"), task)
+    ]
     return {
         (r["method"], r["phase"]): (float(r["mean"]), float(r["std"]), int(r["n"])) for r in rows
     }
+
+
+def label(method: str, experiment: str = "") -> str:
+    """How a method is called in an experiment's table and picture."""
+    return MAIN_LABELS.get(experiment, METHODS[method]) if method == "ours" else METHODS[method]
+
+
+def shown(experiment: str) -> dict[str, list[str]]:
+    """Environment -> the experiment's methods that have a test score, in the order of METHODS."""
+    runs = paper.EXPERIMENTS[experiment].runs
+    found = {
+        env: [m for m in methods if (m, "test") in scores(env)] for env, methods in runs.items()
+    }
+    if experiment not in MAIN_LABELS:
+        order = {method: i for i, method in enumerate(METHODS)}
+        found = {
+            env: sorted(methods, key=lambda m: order.get(m, 0)) for env, methods in found.items()
+        }
+    return {env: methods for env, methods in found.items() if methods}
+
+
+def spread(values: list[float], digits: int = 3) -> str:
+    """Mean and standard deviation over seeds."""
+    return f"{mean(values):.{digits}f} ± {pstdev(values):.{digits}f}"
 
 
 def scores(env: str) -> dict[tuple[str, str], list[dict]]:
@@ -106,7 +163,7 @@ def table(env: str) -> str:
         "| seeds | steps | hours |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for method in [m for m in METHODS if (m, "test") in ours]:
+    for method in shown(env)[env]:
         cells = [METHODS[method]]
         for phase in ("train", "test"):
             values = [float(r["score"]) for r in ours[method, phase]]
@@ -150,13 +207,8 @@ def recipe_table(env: str) -> str:
 
 def bar_figure(env: str, path: Path) -> None:
     """Train and test bars per method, ours filled and published outlined."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     ours, theirs = scores(env), published(env)
-    methods = [m for m in METHODS if (m, "test") in ours]
+    methods = shown(env)[env]
     figure, axes = plt.subplots(1, 2, figsize=(11, 3.8), sharey=True)
     for axis, phase, title in zip(
         axes, ("train", "test"), ("training actions", "unseen actions"), strict=True
@@ -175,9 +227,7 @@ def bar_figure(env: str, path: Path) -> None:
         axis.set_title(title)
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel(TITLES.get(env, env))
-    figure.suptitle(
-        "filled: this repository (dots: seeds)   outlined: published   line: ceiling", fontsize=9
-    )
+    figure.suptitle(BAR_KEY, fontsize=9)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -185,11 +235,6 @@ def bar_figure(env: str, path: Path) -> None:
 
 def curve_figure(env: str, path: Path) -> None:
     """Learning curves (Figure 14): train and validation score, raw, one line per seed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     rows = read(RESULTS / f"{env}_curves.csv")
     methods = [m for m in METHODS if any(r["method"] == m for r in rows)]
     columns = min(5, len(methods))
@@ -217,27 +262,397 @@ def curve_figure(env: str, path: Path) -> None:
     plt.close(figure)
 
 
-def fill(text: str, env: str) -> str:
-    """README text with the table of `env` between its two markers."""
-    start, end = f"<!-- results:{env} -->", f"<!-- end:{env} -->"
+# ---- figures and analyses of the appendix ----
+
+
+def comparison(experiment: str) -> str:
+    """Figures 8, 10, 11, 13, Table 1: one row per environment and method."""
+    lines = [
+        "| environment | method | seen: ours | seen: published | **unseen: ours** "
+        "| unseen: published | seeds | steps |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for env, methods in shown(experiment).items():
+        ours, theirs = scores(env), published(env)
+        for method in methods:
+            cells = [paper.TITLES[env], label(method, experiment)]
+            for phase in ("train", "test"):
+                text = spread([float(r["score"]) for r in ours[method, phase]])
+                known = theirs.get((method, phase))
+                cells.append(text if phase == "train" else f"**{text}**")
+                cells.append(f"{known[0]:.3f} ± {known[1]:.3f}" if known else "-")
+            rows = ours[method, "test"]
+            cells += [str(len(rows)), f"{int(rows[0]['steps']) / 1e6:.2f}M"]
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def overview(experiment: str) -> str:
+    """The main results: methods down, environments across, unseen actions only."""
+    found = shown(experiment)
+    lines = ["| method | " + " | ".join(paper.TITLES[env] for env in found) + " |"]
+    lines.append("|---" * (1 + len(found)) + "|")
+    for method in [m for m in METHODS if any(m in methods for methods in found.values())]:
+        cells = [METHODS[method]]
+        for env, methods in found.items():
+            known = published(env).get((method, "test"))
+            values = [float(r["score"]) for r in scores(env)[method, "test"]]
+            text = spread(values) if method in methods else "-"
+            cells.append(text + (f" ({known[0]:.3f})" if known else ""))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n\nUnseen actions; in brackets: published."
+
+
+def panel_figure(experiment: str, path: Path) -> None:
+    """One panel per environment: per method a pale bar (seen) and a full one (unseen actions)."""
+    found = shown(experiment)
+    columns = min(3, len(found))
+    lines = -(-len(found) // columns)
+    width = max(3.2, 0.5 * max(map(len, found.values())) + 1)
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(width * columns, 3.4 * lines), squeeze=False
+    )
+    for axis, (env, methods) in zip(axes.flat, found.items(), strict=False):
+        ours, theirs = scores(env), published(env)
+        for x, method in enumerate(methods):
+            for at, phase, alpha in ((x - 0.2, "train", 0.35), (x + 0.2, "test", 0.9)):
+                values = [float(r["score"]) for r in ours[method, phase]]
+                axis.bar(at, mean(values), 0.32, color=f"C{x}", alpha=alpha)
+                axis.plot([at] * len(values), values, "k.", ms=3)
+                if (method, phase) in theirs:
+                    m, s, _ = theirs[method, phase]
+                    axis.bar(at, m, 0.4, yerr=s, fill=False, edgecolor="0.35", capsize=2)
+        if env in ppo_actiongen.CEILINGS:
+            axis.axhline(ppo_actiongen.CEILINGS[env][1], color="grey", lw=1)
+        names = [label(m, experiment) for m in methods]
+        axis.set_xticks(range(len(methods)), names, rotation=35, ha="right", fontsize=8)
+        axis.set_title(paper.TITLES[env], fontsize=9)
+        axis.spines[["top", "right"]].set_visible(False)
+    for axis in axes.flat[len(found) :]:
+        axis.axis("off")
+    figure.suptitle(f"pale: seen, full: unseen actions\n{BAR_KEY}", fontsize=7)
+    save(figure, path)
+
+
+def save(figure, path: Path) -> None:
+    """Write a picture and forget the figure."""
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def all_curves(experiment: str, path: Path) -> None:
+    """Figure 14: one row of panels per environment, one column per method."""
+    curves = {env: read(RESULTS / f"{env}_curves.csv") for env in shown(experiment)}
+    methods = [
+        m for m in METHODS if any(r["method"] == m for rows in curves.values() for r in rows)
+    ]
+    methods = [m for m in methods if any(m in found for found in shown(experiment).values())]
+    size = (2.1 * len(methods), 1.9 * len(curves) + 0.4)
+    figure, axes = plt.subplots(len(curves), len(methods), figsize=size, squeeze=False)
+    for line, (env, rows) in zip(axes, curves.items(), strict=True):
+        top = max(float(r[k]) for r in rows for k in ("train_score", "valid_score"))
+        for axis, method in zip(line, methods, strict=True):
+            mine = [r for r in rows if r["method"] == method]
+            axis.set_visible(bool(mine))
+            for seed in sorted({r["seed"] for r in mine}):
+                one = [r for r in mine if r["seed"] == seed]
+                steps = [int(r["step"]) / 1e6 for r in one]
+                for color, key in (("C0", "train_score"), ("C1", "valid_score")):
+                    axis.plot(steps, [float(r[key]) for r in one], color, lw=1, marker=".", ms=2)
+            axis.set_ylim(0, 1.05 * top + 1e-6)
+            axis.set_title(f"{paper.TITLES[env]}\n{METHODS[method]}", fontsize=7)
+            axis.tick_params(labelsize=6)
+    figure.suptitle("seen (blue) and validation actions (orange) over million steps", fontsize=9)
+    save(figure, path)
+
+
+def adaptation(env: str) -> tuple[float | None, dict[str, list[tuple[int, float]]]]:
+    """Figure 9: the zero-shot score, and per variant the seed-averaged curve while it adapts."""
+    zero_shot = [r for r in read(RESULTS / "fig9.csv") if r["env"] == env]
+    most = max((int(r["steps"]) for r in zero_shot), default=0)  # the best trained policies
+    zero_shot = [float(r["score"]) for r in zero_shot if int(r["steps"]) == most]
+    curves = {}
+    for method in paper.ADAPT:
+        rows = [r for r in read(RESULTS / "fig9_curves.csv") if r["env"] == env]
+        rows = [r for r in rows if r["method"] == method]
+        points = defaultdict(list)
+        for r in rows:
+            points[int(r["step"])].append(float(r["episode_score"]))
+        seeds = len({r["seed"] for r in rows})
+        full = [(step, mean(v)) for step, v in sorted(points.items()) if len(v) == seeds]
+        if full:
+            curves[method] = full
+    return (mean(zero_shot) if zero_shot else None), curves
+
+
+def adaptation_table(experiment: str) -> str:
+    """How many steps on the unseen actions it takes to reach what zero-shot has at once."""
+    lines = [
+        "| environment | zero-shot | " + " | ".join(METHODS[m] for m in paper.ADAPT) + " |",
+        "|---" * (2 + len(paper.ADAPT)) + "|",
+    ]
+    for env in paper.EXPERIMENTS[experiment].runs:
+        line, curves = adaptation(env)
+        if not curves:
+            continue
+        cells = [paper.TITLES[env], "-" if line is None else f"{line:.3f}"]
+        for method in paper.ADAPT:
+            steps = [step for step, score in curves.get(method, ()) if score > (line or 0)]
+            if line is None or method not in curves:
+                cells.append("-")
+            elif steps:
+                cells.append(f"{steps[0] / 1e6:.2f}M")
+            else:
+                cells.append(f"not reached in {curves[method][-1][0] / 1e6:.2f}M")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + (
+        "\n\nSteps until the training score, averaged over seeds and over a hundredth of the run, "
+        "first exceeds the zero-shot score on the same set (all test actions at once)."
+    )
+
+
+def adaptation_figure(experiment: str, path: Path) -> None:
+    """Figure 9: one panel per environment, raw training scores and the zero-shot line."""
+    data = {env: adaptation(env) for env in paper.EXPERIMENTS[experiment].runs}
+    data = {env: found for env, found in data.items() if found[1]}
+    figure, axes = plt.subplots(1, len(data), figsize=(3 * len(data), 3), squeeze=False)
+    for axis, (env, (line, curves)) in zip(axes.flat, data.items(), strict=True):
+        for i, method in enumerate(paper.ADAPT):
+            if method in curves:
+                steps, values = zip(*curves[method], strict=True)
+                steps = [step / 1e6 for step in steps]
+                axis.plot(steps, values, f"C{i}", lw=1, marker=".", ms=2, label=METHODS[method])
+        if line is not None:
+            axis.axhline(line, color="k", ls="--", lw=1, label="Ours, zero-shot")
+        axis.set_title(paper.TITLES[env], fontsize=9)
+        axis.set_xlabel("million steps", fontsize=8)
+    axes[0, 0].legend(frameon=False, fontsize=6)
+    save(figure, path)
+
+
+ANALYSES = {  # experiment -> (x column, label of x, name in published_analyses.csv)
+    "analysis-angle": ("min_angle_gap", "degrees to the nearest training tool", "angle"),
+    "analysis-embedding": (
+        "min_embedding_distance",
+        "quantile of the squared distance to the nearest training tool",
+        "emb",
+    ),
+    "analysis-unseen-ratio": ("unseen_ratio", "share of unseen tools", "ratio"),
+    "analysis-set-size": ("num_available", "tools on offer", "action_set_size"),
+    "fig12": ("num_available", "products on offer", ""),
+}
+
+
+def analysed(experiment: str) -> dict[tuple[str, str], dict[float, list[dict]]]:
+    """(environment, method) -> x -> our rows, one per seed; only the largest budget."""
+    rows, column = read(RESULTS / f"{experiment}.csv"), ANALYSES[experiment][0]
+    steps: dict[tuple, int] = defaultdict(int)
+    for r in rows:
+        key = r["env"], r["method"]
+        steps[key] = max(steps[key], int(r["steps"]))
+    table = defaultdict(lambda: defaultdict(list))
+    for r in rows:
+        if int(r["steps"]) == steps[r["env"], r["method"]]:
+            table[r["env"], r["method"]][float(r[column].removeprefix("q"))].append(r)
+    return {key: dict(sorted(points.items())) for key, points in table.items()}
+
+
+def published_analysis(experiment: str, env: str, method: str) -> dict[float, tuple[float, float]]:
+    """x -> published mean and std."""
+    name, task = ANALYSES[experiment][2], env.removeprefix("create-")
+    method = method.replace("ours_analysis", "ours")
+    rows = read(RESULTS / "published_analyses.csv")
+    rows = [r for r in rows if (r["analysis"], r["task"], r["method"]) == (name, task, method)]
+    return {float(r["x"]): (float(r["mean"]), float(r["std"])) for r in rows}
+
+
+def analysis_table(experiment: str) -> str:
+    """x down; environments and methods across, with the number of tools left to choose from."""
+    found, (_, title, name) = analysed(experiment), ANALYSES[experiment]
+    several = len({method for _, method in found}) > 1
+    heads = [
+        paper.TITLES[env] + (f": {METHODS[method]}" if several else "") for env, method in found
+    ]
+    lines = [f"| {title} | {' | '.join(heads)} | actions in the pool |"]
+    lines.append("|---" * (2 + len(found)) + "|")
+    for x in sorted({x for points in found.values() for x in points}):
+        cells, sizes = [f"{x:g}"], []
+        for (env, method), points in found.items():
+            rows = points.get(x, [])
+            text = spread([float(r["score"]) for r in rows]) if rows else "-"
+            # The published distances belong to another table of representations.
+            known = published_analysis(experiment, env, method).get(x) if name != "emb" else None
+            cells.append(text + (f" ({known[0]:.3f})" if known else ""))
+            sizes += [float(r["pool_size"]) for r in rows]
+        sizes = sorted({round(min(sizes)), round(max(sizes))})
+        lines.append("| " + " | ".join([*cells, " to ".join(map(str, sizes))]) + " |")
+    return "\n".join(lines) + "\n\nUnseen actions; in brackets: published."
+
+
+def analysis_figure(experiment: str, path: Path) -> None:
+    """One panel per environment; ours in colour, published in grey."""
+    found, (_, title, name) = analysed(experiment), ANALYSES[experiment]
+    envs = list(dict.fromkeys(env for env, _ in found))
+    figure, axes = plt.subplots(1, len(envs), figsize=(3.4 * len(envs), 3.2), squeeze=False)
+    for axis, env in zip(axes.flat, envs, strict=True):
+        # The published distances belong to another table of representations: an axis of their own.
+        theirs = axis.twiny() if name == "emb" else axis
+        for i, method in enumerate(m for e, m in found if e == env):
+            points = found[env, method]
+            means = [mean(float(r["score"]) for r in rows) for rows in points.values()]
+            axis.plot(list(points), means, f"C{i}o-", ms=3, label=METHODS[method])
+            for x, rows in points.items():
+                axis.plot([x] * len(rows), [float(r["score"]) for r in rows], f"C{i}.", ms=2)
+            known = published_analysis(experiment, env, method)
+            if known:
+                middle, std = zip(*known.values(), strict=True)
+                theirs.errorbar(
+                    list(known), middle, std, color=f"C{i}", ls=":", alpha=0.6, capsize=2,
+                    mfc="none", marker="s", ms=3, lw=1, label=f"{METHODS[method]}, published",
+                )  # fmt: skip
+        if name == "angle":  # harder to the right
+            axis.invert_xaxis() if axis.get_xlim()[0] > axis.get_xlim()[1] else None
+        axis.set_xlabel(title, fontsize=8)
+        axis.set_title(paper.TITLES[env], fontsize=9)
+        axis.set_ylim(0, None)
+    axes[0, 0].legend(frameon=False, fontsize=6)
+    save(figure, path)
+
+
+def encoder_table(experiment: str) -> str:
+    """What each panel's table of representations tells about held-out actions."""
+    rows = [r for r in read(RESULTS / "encoders.csv") if r["figure"] == experiment]
+    names = list(dict.fromkeys(r["score"] for r in rows))
+    names = [n for n in names if not n.startswith("move_") or n == "move_accuracy"]
+    lines = ["| representation | " + " | ".join(f"`{n}`" for n in names) + " |"]
+    lines.append("|---" * (1 + len(names)) + "|")
+    for panel in paper.EXPERIMENTS[experiment].encoders:
+        mine = {r["score"]: r for r in rows if r["panel"] == panel}
+        if mine:
+            cells = [
+                f"{float(mine[n]['value']):.3f}"
+                + (f" ({float(mine[n]['published']):.3f})" if mine[n]["published"] else "")
+                for n in names
+            ]
+            lines.append("| " + " | ".join([panel, *cells]) + " |")
+    return "\n".join(lines) + (
+        "\n\nHeld-out actions, see `probe` in `hvae.py`; in brackets: the published tables."
+    )
+
+
+def tsne_figure(experiment: str, path: Path) -> None:
+    """Figures 4-6: one panel per table, unseen actions coloured by what they do."""
+    rows = read(RESULTS / f"{experiment}.csv")
+    panels = [
+        p for p in paper.EXPERIMENTS[experiment].encoders if any(r["panel"] == p for r in rows)
+    ]
+    names = sorted({r["label"] for r in rows})
+    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 4.2), squeeze=False)
+    for axis, panel in zip(axes.flat, panels, strict=True):
+        for i, name in enumerate(names):
+            mine = [r for r in rows if (r["panel"], r["label"]) == (panel, name)]
+            color = colorsys.hls_to_rgb((i / len(names) + 0.7) % 1, 0.6, 0.9)  # as in hvae.py
+            xy = [(float(r["x"]), float(r["y"])) for r in mine]
+            axis.scatter(*(zip(*xy, strict=True) if xy else ((), ())), s=8, color=color, label=name)
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(panel, fontsize=10)
+        axis.spines[:].set_visible(False)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    columns = min(8, len(names))
+    figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False, fontsize=7)
+    figure.tight_layout(rect=(0, 0.04 + 0.04 * -(-len(names) // columns), 1, 1))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+# ---- README.md ----
+
+
+def has_results(experiment: str) -> bool:
+    """Whether there is anything to show: of a variant more than the main runs beside it."""
+    e = paper.EXPERIMENTS[experiment]
+    if e.encoders or experiment in ANALYSES and experiment != "fig12":
+        return bool(read(RESULTS / f"{experiment}.csv"))
+    if experiment == "fig9":
+        return bool(read(RESULTS / "fig9_curves.csv"))
+    if experiment in ("table-main", "fig14") and len(shown(experiment)) < 2:
+        return False  # one environment has its own table and curves
+    found = {method for methods in shown(experiment).values() for method in methods}
+    return bool(found - ({"ours"} if experiment in MAIN_LABELS else set()))
+
+
+def draw(experiment: str) -> list[Path]:
+    """Draw an experiment's pictures; the paths of what was drawn."""
+    if not has_results(experiment) or experiment in RECIPES:
+        return []
+    path, kind = RESULTS / f"{experiment}.png", paper.EXPERIMENTS[experiment]
+    if kind.encoders:
+        tsne_figure(experiment, path)
+    elif experiment == "fig9":
+        adaptation_figure(experiment, path)
+    elif experiment == "fig12":
+        bar_figure("recsys-full", path)
+    elif experiment == "fig14":
+        all_curves(experiment, path)
+    elif experiment in ANALYSES:
+        analysis_figure(experiment, path)
+    elif experiment in kind.runs:  # one environment, all its methods
+        bar_figure(experiment, path)
+        if read(RESULTS / f"{experiment}_curves.csv"):
+            curve_figure(experiment, RESULTS / f"{experiment}_curves.png")
+            return [path, RESULTS / f"{experiment}_curves.png"]
+    else:
+        panel_figure(experiment, path)
+    return [path]
+
+
+def section(experiment: str) -> str:
+    """What stands between an experiment's markers in README.md; "" without results."""
+    if not has_results(experiment):
+        return ""
+    if experiment in RECIPES:
+        return recipe_table(experiment)
+    kind = paper.EXPERIMENTS[experiment]
+    if experiment in kind.runs:
+        return table(experiment)
+    tables = {
+        "table-main": overview,
+        "fig9": adaptation_table,
+        "fig12": lambda _: table("recsys-full"),
+        "fig14": lambda _: "",
+    }
+    make = tables.get(experiment, comparison)
+    if kind.encoders:
+        make = encoder_table
+    elif experiment in ANALYSES and experiment != "fig12":
+        make = analysis_table
+    parts = [f"### {kind.shows}", make(experiment)]
+    if experiment == "fig12" and read(RESULTS / "fig12.csv"):
+        parts.append(analysis_table("fig12"))
+    parts.append(f"![{kind.shows.split(':')[0]}](results/{experiment}.png)")
+    if experiment != "fig12":
+        parts.append(f"Command: `python benchmarks/paper.py {experiment}`.")
+    return "\n\n".join(filter(None, parts))
+
+
+def fill(text: str, experiment: str) -> str:
+    """README text with an experiment's table between its two markers."""
+    start, end = f"<!-- results:{experiment} -->", f"<!-- end:{experiment} -->"
     before, rest = text.split(start)
-    rows = recipe_table(env) if env in RECIPES else table(env)
-    return f"{before}{start}\n{rows}\n{end}{rest.split(end)[1]}"
+    content = section(experiment)
+    return f"{before}{start}\n{content}{chr(10) if content else ''}{end}{rest.split(end)[1]}"
 
 
 def main() -> None:
     """Draw everything there are results for, and write (or check) the README's tables."""
     readme = ROOT / "README.md"
     text = new = readme.read_text()
-    for path in sorted(RESULTS.glob("*.csv")):
-        env = path.stem
-        if not read(path) or f"<!-- results:{env} -->" not in text:
-            continue
-        new = fill(new, env)
-        if "--check" not in sys.argv and env not in RECIPES:
-            bar_figure(env, RESULTS / f"{env}.png")
-            if read(RESULTS / f"{env}_curves.csv"):
-                curve_figure(env, RESULTS / f"{env}_curves.png")
+    for experiment in paper.EXPERIMENTS:
+        if f"<!-- results:{experiment} -->" in text:
+            new = fill(new, experiment)
+        if "--check" not in sys.argv:
+            draw(experiment)
     if "--check" in sys.argv:
         if new != text:
             raise SystemExit(
