@@ -104,7 +104,8 @@ RUNS: dict[str, dict[str, str]] = {
     "recsys": {
         "ours": "recsys --utility mlp",
         "ours_no_entropy": "recsys --utility mlp --ent-coef 0",
-        "ours_no_subsampling": "recsys --utility mlp --no-subsample",
+        # Two thousand products in every step instead of a hundred: fewer steps.
+        "ours_no_subsampling": "recsys --utility mlp --no-subsample --budget 0.2",
         "nearest_neighbor": "recsys --utility mlp --method nearest-neighbor",
         "continuous_output": "recsys --utility mlp --method continuous",
         "ours_bilinear": "recsys",  # beyond the paper, the fast recipe's default
