@@ -739,7 +739,7 @@ class RunningMeanStd:
 
 def task_options(args: Args) -> dict:
     """The options this environment's constructor takes, from the fields of Args."""
-    names = TASK_OPTIONS[args.env]
+    names = TASK_OPTIONS.get(args.env, ())
     return {n: getattr(args, n) for n in names if getattr(args, n) is not None}
 
 
@@ -1293,10 +1293,10 @@ def check(args: Args) -> None:
         raise ValueError(f"micro_batch {args.micro_batch} is not allowed; at least 0")
     if args.ent_coef < 0 or args.learning_rate <= 0:
         raise ValueError("ent_coef must be at least 0 and learning_rate above 0")
-    if args.task is not None and "task" not in TASK_OPTIONS[args.env]:
+    if args.task is not None and "task" not in TASK_OPTIONS.get(args.env, ()):
         raise ValueError(f"task {args.task!r}: {args.env} has no tasks")
     for name in ("fully_observable", "placement"):
-        if getattr(args, name) and name not in TASK_OPTIONS[args.env]:
+        if getattr(args, name) and name not in TASK_OPTIONS.get(args.env, ()):
             raise ValueError(f"{name} is not an option of {args.env}")
     if args.adapt and args.method == "continuous":
         raise ValueError("adapt: method 'continuous' is not one of utility, nearest-neighbor")
@@ -1747,8 +1747,8 @@ def default_args(env: str, recipe: str, quick: bool) -> Args:
         raise ValueError(f"recipe {recipe!r} is not one of fast, paper")
     args = replace(PRESETS[env], recipe=recipe, quick=quick)
     if recipe == "fast":
-        args = replace(args, **FAST[env])
-    return replace(args, **QUICK[env]) if quick else args
+        args = replace(args, **FAST.get(env, {}))
+    return replace(args, **QUICK.get(env, {})) if quick else args
 
 
 def main() -> None:
