@@ -33,8 +33,9 @@ def runs_of(*names, **options):
 # ---- what is listed ----
 
 
-def test_dry_run_lists_every_figure_and_analysis_and_each_command_once():
+def test_dry_run_lists_every_figure_and_analysis_and_each_command_once(tmp_path):
     command = [sys.executable, "benchmarks/paper.py", "--dry-run", "all", "--seeds", "0"]
+    command += ["--runs-dir", str(tmp_path)]  # nothing is finished there
     out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr
     for name in (*FIGURES, *ANALYSES, "table-main", "table-full-split", "gridworld-recipe"):
@@ -42,7 +43,8 @@ def test_dry_run_lists_every_figure_and_analysis_and_each_command_once():
     for name, experiment in paper.EXPERIMENTS.items():
         assert experiment.runs or experiment.encoders, name
     lines = [line.split("  ")[-1] for line in out.stdout.splitlines() if " h  python " in line]
-    wanted = {job.key for p in paper.plan(paper.Args(("all",), seeds=(0,))) for job in p.everything}
+    plans = paper.plan(paper.Args(("all",), seeds=(0,), runs_dir=str(tmp_path)))
+    wanted = {job.key for p in plans for job in p.everything}
     assert len(lines) == len(wanted) and f"{len(wanted)} of {len(wanted)} to run" in out.stdout
     for method in ("ours", "ours_conditioned_auxiliary", "ours_no_subgoal_reward"):
         flags = paper.RUNS["create-push"][method]
@@ -265,7 +267,8 @@ def test_throughput_refuses_unknown_groups(monkeypatch):
 
 # ---- for real, at tiny budgets ----
 
-TINY = "--minibatch-size 32 --valid-episodes 4 --eval-episodes 4 --representation engineered"
+TINY = "--total-timesteps 256 --num-envs 4 --minibatch-size 32 --valid-episodes 4 "  # 2 rollouts
+TINY += "--eval-episodes 4 --representation engineered"
 FEW = {  # one command of each kind where an experiment has dozens of runs
     "table-main": ("ours", "nearest_neighbor"),
     "fig14": ("ours", "nearest_neighbor"),
@@ -276,7 +279,7 @@ FEW = {  # one command of each kind where an experiment has dozens of runs
 @pytest.mark.slow
 @pytest.mark.parametrize("name", paper.EXPERIMENTS)
 def test_every_experiment_runs_and_is_drawn(name, tmp_path, monkeypatch):
-    words = [name, "--seeds", "0", "--budget", "0.0001", f"--extra={TINY}"]
+    words = [name, "--seeds", "0", f"--extra={TINY}"]
     words += ["--runs-dir", str(tmp_path / "runs"), "--results-dir", str(tmp_path / "results")]
     words += ["--extra-test=--episodes 4", "--hvae-recipe", "quick"]
     words += ["--extra-encoder=--updates 2 --observations 4 --table-observations 4"]
