@@ -1,5 +1,6 @@
 """The HVAE against torch's distributions, the published layer sizes, and damaged files."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -244,6 +245,21 @@ def test_every_observation_is_picked_equally_often():
 # ---- training ----
 
 
+def test_weight_of_the_kls_climbs_to_one(monkeypatch):
+    """The prior p(z | c) is learned through the KL alone: its gradient shows the weight."""
+    raw, seen = batch("xy")[1].numpy(), {}
+    for warmup in (0.0, 0.5):
+        torch.manual_seed(0)
+        args = arguments(updates=4, kl_warmup=warmup, batch_observations=2)
+        model, grads = HVAE(KINDS["xy"][0], args), seen.setdefault(warmup, [])
+        keep = lambda _, limit, m=model, g=grads: g.append(m.p_z.log_var.grad.clone())  # noqa: E731
+        monkeypatch.setattr(hvae.nn.utils, "clip_grad_value_", keep)
+        row = hvae.fit(model, raw, args)[-1]
+        assert np.isclose(row["loss"], row["kl_z"] + row["kl_c"] - row["rec"])  # the whole ELBO
+    torch.testing.assert_close(seen[0.5][0], seen[0.0][0] / 3)  # weights 1/3, 2/3, 1, 1
+    assert len(seen[0.5]) == 4
+
+
 def test_short_training_learns_unseen_skills_and_never_sees_them(tmp_path, monkeypatch):
     asked, fit = [], hvae.fit
     record = gridworld.action_observations
@@ -387,6 +403,73 @@ def test_probe_of_other_environments():
     assert scores["engineered_r2"] < 0.1 and abs(scores["nn_class"] - scores["chance_class"]) < 0.06
 
 
+def test_probe_reads_angles_as_circles_and_nothing_but_the_feature():
+    """Within-class scores: 1 for the feature itself, nothing for knowing the class alone."""
+    module = hvae.load_environment("create")
+    found = hvae.features("create")
+    kinds = np.array([tool.kind for tool in module.TOOLS])
+    circle, group = found["angle"]
+    assert set(group) == {"", "Ramp", "Trampoline", "Cannon", "Fan", "Funnel", "Bucket"}
+    np.testing.assert_allclose((circle**2).sum(1), 1)
+    angle = np.array([tool.angle for tool in module.TOOLS])
+    flat = (kinds == "Ramp") & (angle == 0)  # a ramp of 0 and one of 180 degrees are the same
+    steep, half = (kinds == "Ramp") & (angle == 90), np.array([0, 1])
+    np.testing.assert_allclose(circle[flat], np.tile(half, (flat.sum(), 1)), atol=1e-9)
+    np.testing.assert_allclose(circle[steep], np.tile(-half, (steep.sum(), 1)), atol=1e-9)
+    split = module.split_actions()
+    held_out = hvae.held_out_labels(hvae.resolve(Args(env="create")))[0]
+    assert len(held_out) == 1013 and module.NO_OP not in held_out
+    noise = 1e-3 * np.random.default_rng(0).normal(size=(len(kinds), 2))
+    scores = hvae.probe(circle + noise, split["train"], held_out, "create")
+    assert scores["angle_r2"] > 0.99 and scores["size_r2"] < 0.05
+    only_class = (kinds[:, None] == np.unique(kinds)).astype(float)
+    only_class += 1e-3 * np.random.default_rng(1).normal(size=only_class.shape)
+    scores = hvae.probe(only_class, split["train"], held_out, "create")
+    assert scores["nn_class"] > 0.8 and scores["train_class"] > 0.8
+    for name in ("angle", "size", "elasticity", "force"):
+        assert scores[f"{name}_r2"] < 0.1
+
+
+@pytest.mark.parametrize("env", ["create", "stacking"])
+def test_probe_of_classes_that_were_never_trained_on(env):
+    args = hvae.resolve(Args(env=env, split="full"))
+    rows = hvae.probe_rows(hvae.load_environment(env).engineered_representations(), args)
+    scores = {row["score"]: row["value"] for row in rows}
+    assert all(row["value"] == row["engineered"] or np.isnan(row["value"]) for row in rows)
+    assert (
+        scores["nn_class"] == 1 and scores["engineered_r2"] > 0.99 and "train_class" not in scores
+    )
+    assert scores["size_r2" if env == "create" else "scale_r2"] > 0.99
+
+
+def test_collected_scores_name_their_table_and_its_command(tmp_path):
+    words = [
+        "gridworld",
+        "--updates",
+        "2",
+        "--observations",
+        "8",
+        "--no-plots",
+        "--split-seed",
+        "3",
+    ]
+    assert run(*words, "--no-hierarchical", "--runs-dir", tmp_path).returncode == 0
+    name = "gridworld-xy-vae-default3-laptop-s0"
+    with open(tmp_path / "hvae" / f"{name}-probe.csv") as file:
+        own = list(csv.DictReader(file))
+    script = ["benchmarks/encoders.py", "--runs-dir", tmp_path, "--results-dir", tmp_path]
+    command = [sys.executable, *map(str, script)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with open(tmp_path / "encoders.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["value"] for row in rows] == [row["value"] for row in own]
+    assert {row["table"] for row in rows} == {name}
+    assert rows[0]["command"] == "python hvae.py gridworld --split-seed 3 --no-hierarchical"
+    done = subprocess.run([*command[:3], str(tmp_path / "none")], cwd=ROOT, capture_output=True)
+    assert done.returncode == 1 and done.stderr.startswith(b"error: no tables in")
+
+
 # ---- the file of representations ----
 
 
@@ -507,9 +590,9 @@ def test_command_line_makes_every_file(tmp_path):
                "--runs-dir", tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     stem = "gridworld-xy-hvae-default-laptop-s0"
-    endings = (".npz", ".pt", ".csv", ".json", "-tsne.png", "-reconstructions.png")
+    endings = (".npz", ".pt", ".csv", "-probe.csv", ".json", "-tsne.png", "-reconstructions.png")
     assert {p.name for p in (tmp_path / "hvae").iterdir()} == {stem + end for end in endings}
-    assert "net_r2" in done.stdout and "published 0.946" in done.stdout
+    assert "net_r2" in done.stdout and "published" in done.stdout and " 0.946" in done.stdout
     lines = (tmp_path / "hvae" / f"{stem}.csv").read_text().splitlines()
     assert lines[0] == "update,seconds,loss,rec,kl_z,kl_c,error" and len(lines) == 2
 
