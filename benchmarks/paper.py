@@ -282,7 +282,7 @@ RATES = {  # environment steps per second of one run on one core: benchmarks/thr
 }
 EPISODE = {"gridworld": 10, "recsys": 100, "create": 30, "stacking": 10}  # steps at most, Table 3
 TEST_ACTIONS = {"gridworld": 256, "recsys": 2500, "create": 507, "stacking": 203}  # 2:1:1, A
-# Recipe laptop, one core. `seconds` of the losses' CSV beside each table: 78 s of Grid World (x, y),
+# Recipe laptop, one core. `seconds` of the CSV of losses: 78 s of Grid World (x, y),
 # 228 s one-hot, 575 s CREATE (x, y) on a busy machine; pictures and videos are guessed.
 ENCODER_HOURS = {
     ("gridworld", "xy"): 0.03,
@@ -303,7 +303,7 @@ OPTIONS = (  # what an evaluation is known by
 ).split()
 TEST_COLUMNS = [*"env task method seed steps".split(), *OPTIONS]
 TEST_COLUMNS += "pool_size score stderr return length command".split()
-ENCODER_COLUMNS = "figure panel env score value published command".split()
+ENCODER_COLUMNS = "figure panel env score value engineered published minutes command".split()
 POINT_COLUMNS = "panel action label x y".split()
 
 
@@ -638,33 +638,31 @@ def collect_panel(figure: str, panel: str, encoder: Encoder | None, args: Args) 
 
     env = EXPERIMENTS[figure].encoders[panel].split()[0]
     module = hvae.load_environment(env)
-    seed, split = args.seeds[0], "default"
+    same = {"figure": figure, "panel": panel, "env": env}
     if encoder:
-        options = tyro.cli(hvae.Args, args=encoder.words)
-        split = options.split
-        mean = hvae.load_representation(encoder.path, env, split, options.split_seed)["mean"]
+        options = hvae.resolve(tyro.cli(hvae.Args, args=encoder.words))
+        mean = hvae.load_representation(encoder.path, env, options.split, options.split_seed)[
+            "mean"
+        ]
+        updates = list(csv.DictReader(encoder.path.with_suffix(".csv").open()))
+        minutes = round(float(updates[-1]["seconds"]) / 60, 1)  # of training alone, by the clock
+        same |= {"minutes": minutes, "command": encoder.command}
     else:
+        options = hvae.resolve(hvae.Args(env=env, split_seed=args.seeds[0]))
         mean = np.asarray(module.engineered_representations(), np.float32)
-    ids = module.split_actions(split, seed)
-    held_out = np.setdiff1d(np.concatenate([ids["valid"], ids["test"]]), ids["train"])
-    record = {"scores": hvae.probe(mean, ids["train"], held_out, env), "published": {}}
-    if encoder:  # what hvae.py left beside its table
-        record = json.loads(encoder.path.with_suffix(".json").read_text())
-    command = encoder.command if encoder else f"python benchmarks/paper.py {figure}"
-    same = {"figure": figure, "panel": panel, "env": env, "command": command}
-    rows = [
-        same | {"score": name, "value": value, "published": record["published"].get(name)}
-        for name, value in record["scores"].items()
-    ]
+        same["command"] = f"python benchmarks/paper.py {figure}"
+    rows = [same | row for row in hvae.probe_rows(mean, options)]
+    if not encoder:  # the published scores are of an encoder's table
+        rows = [row | {"published": None} for row in rows]
+    held_out, labels = hvae.held_out_labels(options)
     results_dir = Path(args.results_dir)
     merge(results_dir / "encoders.csv", ENCODER_COLUMNS, rows, ("figure", "panel"))
     perplexity = min(hvae.PERPLEXITY, (len(held_out) - 1) / 3)
     tsne = TSNE(perplexity=perplexity, init="pca", random_state=0)
     places = tsne.fit_transform(mean[held_out])  # (n, D) -> (n, 2)
-    labels = module.action_labels()
     points = [
-        {"panel": panel, "action": i, "label": labels[i], "x": round(x, 1), "y": round(y, 1)}
-        for i, (x, y) in zip(held_out.tolist(), places.tolist(), strict=True)
+        {"panel": panel, "action": i, "label": label, "x": round(x, 1), "y": round(y, 1)}
+        for i, label, (x, y) in zip(held_out.tolist(), labels, places.tolist(), strict=True)
     ]
     merge(results_dir / f"{figure}.csv", POINT_COLUMNS, points, ("panel",))
 

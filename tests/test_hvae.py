@@ -1,6 +1,5 @@
 """The HVAE against torch's distributions, the published layer sizes, and damaged files."""
 
-import csv
 import json
 import subprocess
 import sys
@@ -440,34 +439,6 @@ def test_probe_of_classes_that_were_never_trained_on(env):
         scores["nn_class"] == 1 and scores["engineered_r2"] > 0.99 and "train_class" not in scores
     )
     assert scores["size_r2" if env == "create" else "scale_r2"] > 0.99
-
-
-def test_collected_scores_name_their_table_and_its_command(tmp_path):
-    words = [
-        "gridworld",
-        "--updates",
-        "2",
-        "--observations",
-        "8",
-        "--no-plots",
-        "--split-seed",
-        "3",
-    ]
-    assert run(*words, "--no-hierarchical", "--runs-dir", tmp_path).returncode == 0
-    name = "gridworld-xy-vae-default3-laptop-s0"
-    with open(tmp_path / "hvae" / f"{name}-probe.csv") as file:
-        own = list(csv.DictReader(file))
-    script = ["benchmarks/encoders.py", "--runs-dir", tmp_path, "--results-dir", tmp_path]
-    command = [sys.executable, *map(str, script)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    with open(tmp_path / "encoders.csv") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["value"] for row in rows] == [row["value"] for row in own]
-    assert {row["table"] for row in rows} == {name}
-    assert rows[0]["command"] == "python hvae.py gridworld --split-seed 3 --no-hierarchical"
-    done = subprocess.run([*command[:3], str(tmp_path / "none")], cwd=ROOT, capture_output=True)
-    assert done.returncode == 1 and done.stderr.startswith(b"error: no tables in")
 
 
 # ---- the file of representations ----
