@@ -1166,9 +1166,11 @@ def plot_tsne(mean: np.ndarray, labels: np.ndarray, path: Path, title: str) -> N
     """Figures 4-6: representations (count, D) laid out by t-SNE, one hue and mark per label."""
     from matplotlib.figure import Figure
     from sklearn.manifold import TSNE
+    from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
     perplexity = min(PERPLEXITY, (len(mean) - 1) / 3)
-    places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(mean)
+    with threadpool_limits(1):  # a second thread only waits where other programs run: minutes
+        places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(mean)
     figure = Figure(figsize=(6.5, 5), layout="constrained")
     axes, names = figure.subplots(), sorted(set(labels))
     # Hues of the published code; neighbours in the circle of hues also differ in their marks.
