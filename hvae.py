@@ -1162,15 +1162,21 @@ def report(model, module, mean: np.ndarray, path: Path, args: Args) -> None:
 # ---- pictures ----
 
 
-def plot_tsne(mean: np.ndarray, labels: np.ndarray, path: Path, title: str) -> None:
-    """Figures 4-6: representations (count, D) laid out by t-SNE, one hue and mark per label."""
-    from matplotlib.figure import Figure
+def tsne(mean: np.ndarray) -> np.ndarray:
+    """Representations (count, D) -> places in a plane (count, 2)."""
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
     perplexity = min(PERPLEXITY, (len(mean) - 1) / 3)
     with threadpool_limits(1):  # a second thread only waits where other programs run: minutes
-        places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(mean)
+        return TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(mean)
+
+
+def plot_tsne(mean: np.ndarray, labels: np.ndarray, path: Path, title: str) -> None:
+    """Figures 4-6: representations (count, D) laid out by t-SNE, one hue and mark per label."""
+    from matplotlib.figure import Figure
+
+    places = tsne(mean)
     figure = Figure(figsize=(6.5, 5), layout="constrained")
     axes, names = figure.subplots(), sorted(set(labels))
     # Hues of the published code; neighbours in the circle of hues also differ in their marks.

@@ -634,8 +634,6 @@ def collect_test(test: Test, results_dir: Path) -> None:
 
 def collect_panel(figure: str, panel: str, encoder: Encoder | None, args: Args) -> None:
     """Probe scores and t-SNE places of one table's held-out actions (Figures 4-6)."""
-    from sklearn.manifold import TSNE
-
     env = EXPERIMENTS[figure].encoders[panel].split()[0]
     module = hvae.load_environment(env)
     same = {"figure": figure, "panel": panel, "env": env}
@@ -657,9 +655,7 @@ def collect_panel(figure: str, panel: str, encoder: Encoder | None, args: Args) 
     held_out, labels = hvae.held_out_labels(options)
     results_dir = Path(args.results_dir)
     merge(results_dir / "encoders.csv", ENCODER_COLUMNS, rows, ("figure", "panel"))
-    perplexity = min(hvae.PERPLEXITY, (len(held_out) - 1) / 3)
-    tsne = TSNE(perplexity=perplexity, init="pca", random_state=0)
-    places = tsne.fit_transform(mean[held_out])  # (n, D) -> (n, 2)
+    places = hvae.tsne(mean[held_out])  # (n, D) -> (n, 2)
     points = [
         {"panel": panel, "action": i, "label": label, "x": round(x, 1), "y": round(y, 1)}
         for i, label, (x, y) in zip(held_out.tolist(), labels, places.tolist(), strict=True)
