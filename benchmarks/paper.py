@@ -4,6 +4,7 @@
     python benchmarks/paper.py gridworld --jobs 2             # run them, two at a time
     python benchmarks/paper.py fig8 --budget 0.1 --seeds 0 1 2
     python benchmarks/paper.py gridworld --methods ours engineered
+    python benchmarks/paper.py fig9 --environments gridworld
 
 Three kinds of commands: hvae.py trains an encoder, ppo_actiongen.py trains a policy, and
 `ppo_actiongen.py evaluate` tests a finished policy with other sets of actions. A run is named after
@@ -315,6 +316,8 @@ class Args:
     """Names of experiments, or `all`."""
     methods: tuple[str, ...] = ()
     """Only these methods (default: all of the experiment)."""
+    environments: tuple[str, ...] = ()
+    """Only these environments, as in gridworld or create-push (default: all it shows)."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Training seeds; the same number seeds the random split of the actions."""
     budget: float = 1.0
@@ -532,8 +535,13 @@ def plan(args: Args) -> list[Plan]:
         for method in args.methods if known else ():
             if method not in known:
                 raise ValueError(f"method {method!r} is not one of {', '.join(known)}")
+        for env in args.environments if known else ():
+            if env not in e.runs:
+                raise ValueError(f"environment {env!r} is not one of {', '.join(e.runs)}")
         for seed in args.seeds:  # seed by seed, so that an interrupted matrix is still balanced
             for env, methods in e.runs.items():
+                if args.environments and env not in args.environments:
+                    continue
                 for method in (m for m in methods if m in (args.methods or known)):
                     run = make_run(env, method, seed, args)
                     for each in filter(None, (run.start, run)):  # a fine-tuned run after its start
