@@ -12,7 +12,7 @@ what it is, so figures that show the same run share it. What is finished is skip
 goes on from its checkpoint. Scores are written after every command, each row with its command, and
 benchmarks/report.py draws them:
 
-    results/<environment>.csv, _curves.csv    runs and their learning curves
+    results/<environment>.csv, _curves.csv    runs and their learning curves (create: all tasks)
     results/<experiment>.csv                  evaluations (analyses, fig9, fig12), t-SNE (fig4-6)
     results/fig9_curves.csv                   scores during fine-tuning
     results/encoders.csv                      what the encoders' tables tell (fig4-6)
@@ -621,15 +621,20 @@ def merge(path: Path, columns: list[str], rows: list[dict], key: tuple[str, ...]
     ppo_actiongen.write_atomically(path, write)
 
 
+def file_of(env: str) -> str:
+    """All CREATE tasks share one file; the column env tells them apart."""
+    return "create" if env.startswith("create-") else env
+
+
 def collect_run(run: Run, results_dir: Path) -> None:
     """Write one finished run into the tables."""
     scores, curve = rows_of(run)
     key = ("env", "method", "seed", "command")
-    merge(results_dir / f"{run.env}.csv", COLUMNS, scores, key)
+    merge(results_dir / f"{file_of(run.env)}.csv", COLUMNS, scores, key)
     if run.method in ADAPT:
         merge(results_dir / "fig9_curves.csv", ADAPT_COLUMNS, adaptation_of(run), key[:3])
     else:
-        merge(results_dir / f"{run.env}_curves.csv", CURVE_COLUMNS, curve, key[:3])
+        merge(results_dir / f"{file_of(run.env)}_curves.csv", CURVE_COLUMNS, curve, key[:3])
 
 
 def collect_test(test: Test, results_dir: Path) -> None:

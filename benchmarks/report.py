@@ -140,9 +140,14 @@ def spread(values: list[float], digits: int = 3) -> str:
     return f"{mean(values):.{digits}f} ± {pstdev(values):.{digits}f}"
 
 
+def runs_of(env: str, kind: str = "") -> list[dict]:
+    """Rows of one environment: of its runs, or with kind "_curves" of their learning curves."""
+    return [r for r in read(RESULTS / f"{paper.file_of(env)}{kind}.csv") if r["env"] == env]
+
+
 def scores(env: str) -> dict[tuple[str, str], list[dict]]:
     """(method, phase) -> our rows, one per seed; only the largest budget of each method."""
-    rows = read(RESULTS / f"{env}.csv")
+    rows = runs_of(env)
     steps: dict[str, int] = defaultdict(int)
     for r in rows:
         steps[r["method"]] = max(steps[r["method"]], int(r["steps"]))
@@ -179,7 +184,7 @@ def table(env: str) -> str:
     lines.append(
         f"\n{note}± is the standard deviation over seeds; hours are per seed on one CPU core. "
         f"Command: `python benchmarks/paper.py {env}`; every row's own command is in "
-        f"`results/{env}.csv`."
+        f"`results/{paper.file_of(env)}.csv`."
     )
     return "\n".join(lines)
 
@@ -235,7 +240,7 @@ def bar_figure(env: str, path: Path) -> None:
 
 def curve_figure(env: str, path: Path) -> None:
     """Learning curves (Figure 14): train and validation score, raw, one line per seed."""
-    rows = read(RESULTS / f"{env}_curves.csv")
+    rows = runs_of(env, "_curves")
     methods = [m for m in METHODS if any(r["method"] == m for r in rows)]
     columns = min(5, len(methods))
     lines = -(-len(methods) // columns)
@@ -343,7 +348,7 @@ def save(figure, path: Path) -> None:
 
 def all_curves(experiment: str, path: Path) -> None:
     """Figure 14: one row of panels per environment, one column per method."""
-    curves = {env: read(RESULTS / f"{env}_curves.csv") for env in shown(experiment)}
+    curves = {env: runs_of(env, "_curves") for env in shown(experiment)}
     methods = [
         m for m in METHODS if any(r["method"] == m for rows in curves.values() for r in rows)
     ]
@@ -610,7 +615,7 @@ def draw(experiment: str) -> list[Path]:
         analysis_figure(experiment, path)
     elif experiment in kind.runs:  # one environment, all its methods
         bar_figure(experiment, path)
-        if read(RESULTS / f"{experiment}_curves.csv"):
+        if runs_of(experiment, "_curves"):
             curve_figure(experiment, RESULTS / f"{experiment}_curves.png")
             return [path, RESULTS / f"{experiment}_curves.png"]
     else:

@@ -292,7 +292,8 @@ def test_every_experiment_runs_and_is_drawn(name, tmp_path, monkeypatch):
     (plan,) = paper.plan(args)
     assert all(job.finished for job in plan.everything)
     for run in plan.runs:
-        rows = list(csv.DictReader((tmp_path / "results" / f"{run.env}.csv").open()))
+        file = f"{paper.file_of(run.env)}.csv"
+        rows = list(csv.DictReader((tmp_path / "results" / file).open()))
         phases = {r["phase"] for r in rows if r["command"] == run.command}
         assert phases == ({"train"} if run.method in paper.ADAPT else {"train", "valid", "test"})
     if plan.tests:
