@@ -1017,7 +1017,13 @@ def features(env: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     phase = 2 * np.pi * angle / np.maximum(turn, 1)
     circle = np.stack([np.sin(phase), np.cos(phase)], 1)
     if env == "stacking":
-        return {"angle": (circle, np.where(turn > 0, kinds, ""))} | found
+        # Half of six scales are too few for a read-out per class: one for all of them. And the
+        # cameras stand all around a shape, so only the side on which the sun falls tells an angle.
+        every = np.full(len(kinds), "all shapes")
+        return {
+            "angle": (circle, np.where(turn > 0, kinds, "")),
+            "scale": (*columns.values(), every),
+        }
     corners = (turn > 0) & (turn < 180)  # polygons look the same again after 60 to 120 degrees
     found["corner"] = (circle, np.where(corners, kinds, ""))
     return {"angle": (circle, np.where(turn >= 180, kinds, ""))} | found
