@@ -308,7 +308,7 @@ FAST = {
 # --quick: the fast recipe with a smaller budget, never another algorithm.
 QUICK = {
     "gridworld": dict(total_timesteps=4_000_000, hvae_recipe="quick"),
-    "recsys": dict(total_timesteps=1_500_000),
+    "recsys": dict(total_timesteps=1_000_000),
     "create": dict(total_timesteps=400_000, hvae_recipe="quick", eval_episodes=500),
     "stacking": dict(total_timesteps=40_000, hvae_recipe="quick", eval_episodes=200),
 }
