@@ -217,6 +217,91 @@ def learner() -> Iterator[Row]:
             run.envs.close()
 
 
+def _plain_form(agent) -> None:
+    """Make an image agent compute as D.3.2 reads: ordinary layers, one concatenation per action."""
+    import torch
+    import torch.nn.functional as F
+
+    def choice_logits(code, available, P):
+        c = agent.action_project(agent.table[available])  # (B, K, H)
+        s = code[:, None].expand(-1, available.shape[1], -1)  # (B, K, H)
+        hidden = F.relu(agent.utility_hidden(torch.cat([s, c], -1)))  # (B, K, W)
+        return agent.utility_out(hidden)[..., 0]  # (B, K)
+
+    agent.choice_logits = choice_logits
+    agent.project_actions = lambda ids=None: None
+    for layer in agent.encoder.conv:
+        layer.inplace = False
+    agent.encoder.conv.to(memory_format=torch.contiguous_format)
+    agent.encoder.convolve = lambda state: agent.encoder.conv(
+        state.permute(0, 3, 1, 2).contiguous() / 255.0
+    )
+
+
+def _torchrun(updates: int) -> tuple[float, float]:
+    """CREATE push in two processes: steps per second by the wall clock, CPU seconds of all."""
+    import csv
+    import subprocess
+    import tempfile
+
+    root = Path(__file__).resolve().parent.parent
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2"]
+    command += [str(root / "ppo_actiongen.py"), "create", "--representation", "engineered"]
+    command += ["--total-timesteps", str(updates * 4 * 3072), "--eval-every", "1000000000"]
+    command += ["--valid-episodes", "2", "--eval-episodes", "2", "--no-tensorboard"]
+    with tempfile.TemporaryDirectory() as folder:
+        before = sum(os.times()[2:4])
+        subprocess.run([*command, "--runs-dir", folder], check=True, capture_output=True)
+        used = sum(os.times()[2:4]) - before
+        (metrics,) = Path(folder).glob("*/metrics.csv")
+        return max(float(row["sps"]) for row in csv.DictReader(metrics.open())), used
+
+
+@group
+def image() -> Iterator[Row]:
+    """CREATE push end to end (physics, pictures, learning) in both forms; Stacking's learner.
+
+    By the processor's clock, so that other programs on the machine count less.
+    """
+    clock, cpu, rates = time.process_time, "per CPU second of one core", {}
+    for form in ("fast", "plain"):
+        run, rollout, update = _learner("create", recipe="fast", threads=1)
+        if form == "plain":
+            _plain_form(run.agent)
+            run.args.micro_batch = 0
+        start = clock()
+        batch = rollout()
+        middle = clock()
+        update(batch)
+        total, acting = clock() - start, middle - start
+        rates[form] = run.batch_size / total
+        what = f"create push, {form} form"
+        yield f"{what}: rollout alone", run.batch_size / acting, "steps/s", "-", cpu
+        learning = run.batch_size / (total - acting)
+        yield f"{what}: update alone", learning, "steps/s", "-", cpu
+        yield f"{what}: end to end", rates[form], "steps/s", "850", cpu + "; aim"
+        run.envs.close()
+    yield "  ratio to the plain form", rates["fast"] / rates["plain"], "x", "", "same process"
+    (_, one), (wall, three) = _torchrun(1), _torchrun(3)
+    both = 2 * (2 * 4 * 3072) / (three - one)  # two more rollouts, without start and end
+    note = "per CPU second of both, times 2: what two free cores give"
+    yield "create push, torchrun, 2 processes", both, "steps/s", "1,700", note + "; aim"
+    yield "  the same by the wall clock", wall, "steps/s", "", "best update; depends on the load"
+
+    # Stacking waits for Bullet nine tenths of its time, so its learner is looked at alone.
+    run, rollout, update = _learner("stacking", recipe="fast", threads=1, minibatch_size=256)
+    batch, P = rollout(), run.agent.project_actions()
+    state, available = (batch[k][0] for k in ("state", "available"))  # (N, ...)
+    start = clock()
+    for _ in range(run.num_steps):
+        run.agent.act(state, available, P, run.generator)
+    update(batch)
+    speed = run.batch_size / (clock() - start)
+    note = f"{cpu}; ceiling: another machine's, without simulation"
+    yield "stacking: acting and learning alone", speed, "steps/s", "1,200", note
+    run.envs.close()
+
+
 @group
 def create() -> Iterator[Row]:
     """CREATE: every task, random placements, picture included; batches of 32; the probe ball."""
