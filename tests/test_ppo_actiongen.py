@@ -47,6 +47,10 @@ def seeded():
     torch.manual_seed(0)
 
 
+def parameter_vector(agent):
+    return torch.cat([p.detach().flatten() for p in agent.parameters()])
+
+
 def random_sets(rows, K=5, A=30, seed=0):
     rng = np.random.default_rng(seed)
     return torch.as_tensor(np.stack([rng.choice(A, K, replace=False) for _ in range(rows)]))
@@ -268,6 +272,113 @@ def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss():
     assert parts["clip_fraction"] == 0  # nothing has changed yet
 
 
+# ---- image states ----
+
+FRAMES = gym.spaces.Box(0, 255, (3, 84, 84), np.uint8)
+
+
+def image_batch(agent, T, N):
+    """A made-up rollout (T, N, ...) of random pictures, as `rollout` would store it."""
+    rng = torch.Generator().manual_seed(5)
+    state = torch.randint(0, 256, (T * N, 84, 84, 3), generator=rng)
+    state = (state * torch.rand(T * N, 1, 1, 1, generator=rng)).byte()  # some dark, some bright
+    sets = random_sets(T * N, A=20)  # training actions only
+    action, logprob, value = agent.act(state, sets, agent.project_actions(), rng)
+    flat = dict(state=state, available=sets, logprob=logprob - 0.1, value=value) | action
+    flat["advantage"] = torch.randn(T * N, generator=rng)
+    flat["return"] = torch.randn(T * N, generator=rng)
+    return {k: v.detach().unflatten(0, (T, N)) for k, v in flat.items()}
+
+
+def plain_features(encoder, state):
+    """The convolutions as D.3.2 reads: float32, one layer after the other, new memory for each."""
+    x = state.permute(0, 3, 1, 2).contiguous().float() / 255
+    for layer in encoder.conv:
+        if isinstance(layer, torch.nn.Conv2d):
+            x = F.relu(F.conv2d(x, layer.weight.contiguous(), layer.bias, stride=2, padding=1))
+    return x.flatten(1)
+
+
+def gradient_of(features, encoder, state):
+    encoder.zero_grad()
+    out = features(state)
+    out.square().mean().backward()  # nothing cancels, so rounding shows at its own size
+    conv = [p.grad.flatten() for n, p in encoder.named_parameters() if n.startswith("conv")]
+    return out.detach(), torch.cat(conv)
+
+
+def cosine(a, b):
+    return F.cosine_similarity(a.flatten().double(), b.flatten().double(), dim=0).item()
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_fast_convolutions_equal_the_plain_ones(channels):
+    space = gym.spaces.Box(0, 255, (channels, 84, 84), np.uint8)
+    agent, _ = make_agent(HYBRID, space)
+    encoder, state = agent.encoder, torch.randint(0, 256, (40, 84, 84, channels)).byte()
+    out, grad = gradient_of(lambda s: plain_features(encoder, s), encoder, state)
+    encoder.bf16 = False
+    same_out, same_grad = gradient_of(encoder.convolve, encoder, state)
+    torch.testing.assert_close(same_out, out, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(same_grad, grad, rtol=1e-3, atol=1e-7)
+    encoder.bf16 = True
+    near_out, near_grad = gradient_of(encoder.convolve, encoder, state)
+    assert near_out.dtype == torch.float32
+    # bfloat16 keeps 8 bits: a number is off by one part in 512 at most, in five layers.
+    assert (near_out - out).norm() / out.norm() < 5 / 512 and cosine(near_out, out) > 0.9999
+    assert (near_grad - grad).norm() / grad.norm() < 10 / 512 and cosine(near_grad, grad) > 0.9999
+
+
+def gradient_of_update(agent, args, batch):
+    """What one minibatch's update subtracts from the parameters at learning rate 1."""
+    before = parameter_vector(agent)
+    optimizer = torch.optim.SGD(agent.parameters(), lr=1.0)
+    noise = torch.Generator().manual_seed(0)
+    ppo.update(agent, optimizer, batch, 0.01, args, noise, torch.device("cpu"))
+    return before - parameter_vector(agent)
+
+
+@pytest.mark.parametrize("method", ["utility", "continuous", "nearest-neighbor"])
+def test_micro_batches_add_up_to_the_gradient_of_the_minibatch(method):
+    once = dict(update_epochs=1, num_minibatches=1, max_grad_norm=1e9, method=method)
+    agent, args = make_agent(HYBRID, FRAMES, bf16=False, **once)
+    start, batch = {k: v.clone() for k, v in agent.state_dict().items()}, image_batch(agent, 8, 6)
+    # The plain form: the whole minibatch at once, the table projected inside it, plain layers.
+    flat = {k: v.flatten(0, 1) for k, v in batch.items()}
+    adv = flat["advantage"]
+    flat["advantage"] = (adv - adv.mean()) / (adv.std() + 1e-5)
+    fast, agent.encoder.convolve = (
+        agent.encoder.convolve,
+        lambda state: plain_features(agent.encoder, state),
+    )
+    ppo.ppo_loss(agent, flat, agent.project_actions(), 0.01, args)[0].backward()
+    plain = torch.cat([p.grad.flatten() for p in agent.parameters()])
+    agent.encoder.convolve = fast
+    for micro in (0, 48, 13, 1):  # 13: the last one is smaller
+        agent.load_state_dict(start)
+        grad = gradient_of_update(agent, replace(args, micro_batch=micro), batch)
+        torch.testing.assert_close(grad, plain, rtol=1e-3, atol=2e-6)
+    agent.encoder.bf16 = True
+    agent.load_state_dict(start)
+    near = gradient_of_update(agent, replace(args, micro_batch=16), batch)
+    assert cosine(near, plain) > 0.999
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_bfloat16_updates_repeat_bit_for_bit(threads):
+    before, results = torch.get_num_threads(), []
+    torch.set_num_threads(threads)
+    for _ in range(2):
+        agent, args = make_agent(HYBRID, FRAMES, bf16=True, micro_batch=7, update_epochs=2)
+        optimizer = torch.optim.AdamW(agent.parameters(), lr=1e-3, fused=True)
+        noise = torch.Generator().manual_seed(0)
+        batch = image_batch(agent, 8, 8)
+        ppo.update(agent, optimizer, batch, 0.01, args, noise, torch.device("cpu"))
+        results.append(parameter_vector(agent))
+    torch.set_num_threads(before)
+    assert torch.equal(*results)
+
+
 # ---- presets: Tables 3 and 4 ----
 
 
@@ -374,6 +485,88 @@ def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path, mo
     assert timeless(folder) == timeless(killed) and same_weights(folder, killed)
 
 
+JOINT = """
+import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
+import torch, torch.distributed as dist
+import ppo_actiongen as ppo
+from test_ppo_actiongen import joint_update
+if ppo.WORLD_SIZE > 1:
+    dist.init_process_group("gloo")
+name = f"{{ppo.RANK}}of{{ppo.WORLD_SIZE}}"
+torch.save(joint_update(ppo.RANK, ppo.WORLD_SIZE), {folder!r} + "/" + name)
+"""
+
+
+def joint_update(rank, world):
+    """Three updates by this process's share (N / world environments) of one made-up rollout."""
+    agent, args = make_agent(HYBRID, num_minibatches=1, update_epochs=3, micro_batch=5)
+    rng, T, N = torch.Generator().manual_seed(1), 6, 4
+    state, sets = torch.randn(T * N, 7, generator=rng), random_sets(T * N, A=20)
+    action, logprob, value = agent.act(state, sets, agent.project_actions(), rng)
+    flat = dict(state=state, available=sets, logprob=logprob, value=value) | action
+    flat["advantage"] = 3 + torch.randn(T * N, generator=rng)
+    flat["return"] = torch.randn(T * N, generator=rng)
+    mine = slice(rank * N // world, (rank + 1) * N // world)
+    batch = {k: v.detach().unflatten(0, (T, N))[:, mine] for k, v in flat.items()}
+    optimizer, noise = torch.optim.AdamW(agent.parameters(), lr=1e-3), torch.Generator()
+    parts = ppo.update(agent, optimizer, batch, 0.01, args, noise, torch.device("cpu"))
+    scale = ppo.RewardScale(N // world, 0.99)
+    rewards = np.random.default_rng(0).random((T, N))[:, mine]
+    scale(rewards, np.zeros_like(rewards))
+    vector = parameter_vector(agent)
+    return {"agent": vector, "parts": parts, "scale": scale.stats.state()}
+
+
+def torchrun(count, *words):
+    options = ["--standalone", f"--nproc_per_node={count}"]
+    return run([sys.executable, "-m", "torch.distributed.run", *options, *words])
+
+
+def test_two_processes_learn_what_one_learns_from_the_joint_batch(tmp_path):
+    script = tmp_path / "joint.py"
+    script.write_text(JOINT.format(root=str(ROOT), folder=str(tmp_path)))
+    for count in (1, 2):
+        result = torchrun(count, str(script))
+        assert result.returncode == 0, result.stderr
+    one, first, second = (torch.load(tmp_path / n) for n in ("0of1", "0of2", "1of2"))
+    assert torch.equal(first["agent"], second["agent"])  # the same bits on both
+    assert (
+        one["agent"] - parameter_vector(make_agent(HYBRID)[0])
+    ).abs().max() > 1e-3  # it did learn
+    torch.testing.assert_close(first["agent"], one["agent"], rtol=1e-4, atol=1e-5)
+    for key in ("parts", "scale"):
+        torch.testing.assert_close(first[key], one[key], rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=0)
+
+
+def test_a_run_in_two_processes(tmp_path):
+    words = command(tmp_path, "--valid-episodes", "33", "--recipe", "paper", steps=1536)[1:]
+    result = torchrun(2, *words)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("unseen") == 1  # only one of them speaks
+    (folder,) = tmp_path.iterdir()
+    rows = list(csv.DictReader((folder / "metrics.csv").open()))
+    assert [r["step"] for r in rows] == [str(256 * i) for i in range(1, 7)]
+    results = json.loads((folder / "results.json").read_text())
+    assert results["test"]["episodes"] == 64
+    assert results["command"].startswith("torchrun --nproc_per_node=2 ppo_actiongen.py gridworld")
+    checkpoint = ppo.load_checkpoint(folder / "checkpoint.pt", "cpu")
+    assert checkpoint["preprocess"]["count"].item() == pytest.approx(1536 + 1e-4)  # of both
+    assert not torch.equal(*checkpoint["generator"])  # each draws its own noise
+    before, more = (folder / "metrics.csv").read_bytes(), ["--resume", "--run-name", folder.name]
+    result = run([sys.executable, *words, *more])  # one process cannot go on with it
+    assert "2 processes there, 1 here" in result.stderr and result.stderr.count("\n") == 1
+    result = torchrun(2, *words)
+    assert result.stderr.count("error: ") == 1 and "--resume" in result.stderr
+    assert (folder / "metrics.csv").read_bytes() == before
+
+
+def test_environments_must_divide_among_processes(monkeypatch):
+    monkeypatch.setattr(ppo, "WORLD_SIZE", 3)
+    with pytest.raises(ValueError, match="multiples of torchrun's 3 processes"):
+        ppo.check(ppo.default_args("gridworld", "fast", False))
+
+
 def test_evaluate_a_saved_run(finished, monkeypatch, capsys):
     folder, _ = finished
     args = ["--num-available", "20", "--episodes", "41", "--actions", "valid"]
@@ -416,6 +609,7 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--task", "push"], "'push'"),
         (["--placement", "1d"], "placement"),
         (["--minibatch-size", "7"], "multiple of num_envs"),
+        (["--micro-batch", "-1"], "micro_batch -1"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_leaves_nothing(
