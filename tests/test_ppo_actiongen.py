@@ -284,7 +284,9 @@ def image_batch(agent, T, N):
     state = (state * torch.rand(T * N, 1, 1, 1, generator=rng)).byte()  # some dark, some bright
     sets = random_sets(T * N, A=20)  # training actions only
     action, logprob, value = agent.act(state, sets, agent.project_actions(), rng)
-    flat = dict(state=state, available=sets, logprob=logprob - 0.1, value=value) | action
+    # Ratios inside the clip range and on both sides of it, none where rounding could change sides.
+    logprob = logprob + torch.tensor([-0.05, 0.05, -0.3, 0.3]).repeat(T * N // 4)
+    flat = dict(state=state, available=sets, logprob=logprob, value=value) | action
     flat["advantage"] = torch.randn(T * N, generator=rng)
     flat["return"] = torch.randn(T * N, generator=rng)
     return {k: v.detach().unflatten(0, (T, N)) for k, v in flat.items()}
@@ -358,10 +360,20 @@ def test_micro_batches_add_up_to_the_gradient_of_the_minibatch(method):
         agent.load_state_dict(start)
         grad = gradient_of_update(agent, replace(args, micro_batch=micro), batch)
         torch.testing.assert_close(grad, plain, rtol=1e-3, atol=2e-6)
+    if method != "utility":  # bfloat16: the paper's policy only; the encoder is the same in all
+        return
     agent.encoder.bf16 = True
     agent.load_state_dict(start)
     near = gradient_of_update(agent, replace(args, micro_batch=16), batch)
-    assert cosine(near, plain) > 0.999
+    # Advantages have mean 0, so much of the sum cancels; rounding is relative to what was added.
+    parts = []
+    for i in range(len(adv)):
+        agent.load_state_dict(start)
+        agent.zero_grad()
+        row = {k: v[i : i + 1] for k, v in flat.items()}
+        ppo.ppo_loss(agent, row, agent.project_actions(), 0.01, args)[0].backward()
+        parts.append(torch.cat([p.grad.flatten() for p in agent.parameters()]).norm())
+    assert (near - plain).norm() / torch.stack(parts).mean() < 10 / 512
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -490,8 +502,7 @@ import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
 import torch, torch.distributed as dist
 import ppo_actiongen as ppo
 from test_ppo_actiongen import joint_update
-if ppo.WORLD_SIZE > 1:
-    dist.init_process_group("gloo")
+dist.init_process_group("gloo")
 name = f"{{ppo.RANK}}of{{ppo.WORLD_SIZE}}"
 torch.save(joint_update(ppo.RANK, ppo.WORLD_SIZE), {folder!r} + "/" + name)
 """
@@ -508,7 +519,8 @@ def joint_update(rank, world):
     flat["return"] = torch.randn(T * N, generator=rng)
     mine = slice(rank * N // world, (rank + 1) * N // world)
     batch = {k: v.detach().unflatten(0, (T, N))[:, mine] for k, v in flat.items()}
-    optimizer, noise = torch.optim.AdamW(agent.parameters(), lr=1e-3), torch.Generator()
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=1e-3, eps=args.adam_eps)
+    noise = torch.Generator()
     parts = ppo.update(agent, optimizer, batch, 0.01, args, noise, torch.device("cpu"))
     scale = ppo.RewardScale(N // world, 0.99)
     rewards = np.random.default_rng(0).random((T, N))[:, mine]
@@ -525,14 +537,12 @@ def torchrun(count, *words):
 def test_two_processes_learn_what_one_learns_from_the_joint_batch(tmp_path):
     script = tmp_path / "joint.py"
     script.write_text(JOINT.format(root=str(ROOT), folder=str(tmp_path)))
-    for count in (1, 2):
-        result = torchrun(count, str(script))
-        assert result.returncode == 0, result.stderr
-    one, first, second = (torch.load(tmp_path / n) for n in ("0of1", "0of2", "1of2"))
+    result = torchrun(2, str(script))
+    assert result.returncode == 0, result.stderr
+    first, second = (torch.load(tmp_path / n) for n in ("0of2", "1of2"))
+    one, start = joint_update(0, 1), parameter_vector(make_agent(HYBRID)[0])
     assert torch.equal(first["agent"], second["agent"])  # the same bits on both
-    assert (
-        one["agent"] - parameter_vector(make_agent(HYBRID)[0])
-    ).abs().max() > 1e-3  # it did learn
+    assert (one["agent"] - start).abs().max() > 1e-3  # it did learn
     torch.testing.assert_close(first["agent"], one["agent"], rtol=1e-4, atol=1e-5)
     for key in ("parts", "scale"):
         torch.testing.assert_close(first[key], one[key], rtol=1e-4, atol=1e-6)
