@@ -136,8 +136,9 @@ def shown(experiment: str) -> dict[str, list[str]]:
 
 
 def spread(values: list[float], digits: int = 3) -> str:
-    """Mean and standard deviation over seeds."""
-    return f"{mean(values):.{digits}f} ± {pstdev(values):.{digits}f}"
+    """Mean and, of two seeds or more, their standard deviation."""
+    deviation = f" ± {pstdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{mean(values):.{digits}f}{deviation}"
 
 
 def runs_of(env: str, kind: str = "") -> list[dict]:
@@ -173,7 +174,8 @@ def table(env: str) -> str:
         for phase in ("train", "test"):
             values = [float(r["score"]) for r in ours[method, phase]]
             bold = "**" if phase == "test" else ""
-            cells.append(f"{bold}{mean(values):.3f}{bold} ± {pstdev(values):.3f}")
+            cells.append(f"{bold}{spread(values)}".replace(" ±", f"{bold} ±"))
+            cells[-1] += "" if len(values) > 1 else bold
             known = theirs.get((method, phase))
             cells.append(f"{known[0]:.3f} ± {known[1]:.3f}" if known else "-")
         rows = ours[method, "test"]
