@@ -233,8 +233,8 @@ def bar_figure(env: str, path: Path) -> None:
         axis.set_xticks(range(len(methods)), [METHODS[m] for m in methods], rotation=35, ha="right")
         axis.set_title(title)
         axis.spines[["top", "right"]].set_visible(False)
-    axes[0].set_ylabel(TITLES.get(env, env))
-    figure.suptitle(BAR_KEY, fontsize=9)
+    name = TITLES.get(env, paper.TITLES.get(env, env))
+    figure.suptitle(f"{name}\n{BAR_KEY}", fontsize=9)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -247,23 +247,27 @@ def curve_figure(env: str, path: Path) -> None:
     columns = min(5, len(methods))
     lines = -(-len(methods) // columns)
     figure, axes = plt.subplots(
-        lines, columns, figsize=(2.6 * columns, 2.3 * lines), sharey=True, squeeze=False
+        lines,
+        columns,
+        figsize=(max(5, 2.6 * columns), 2.6 if lines == 1 else 2.3 * lines),
+        sharey=True,
+        squeeze=False,
     )
     for axis, method in zip(axes.flat, methods, strict=False):
         mine = [r for r in rows if r["method"] == method]
         for seed in sorted({r["seed"] for r in mine}):
             one = [r for r in mine if r["seed"] == seed]
             steps = [int(r["step"]) / 1e6 for r in one]
-            axis.plot(steps, [float(r["train_score"]) for r in one], "C0", lw=1)
-            axis.plot(steps, [float(r["valid_score"]) for r in one], "C1", lw=1)
+            marker = "." if len(one) < 3 else None  # a line needs two points to be seen
+            axis.plot(steps, [float(r["train_score"]) for r in one], "C0", lw=1, marker=marker)
+            axis.plot(steps, [float(r["valid_score"]) for r in one], "C1", lw=1, marker=marker)
         axis.set_title(METHODS[method], fontsize=9)
     for axis in axes.flat[len(methods) :]:
         axis.axis("off")
     for axis in axes[-1]:
         axis.set_xlabel("million steps", fontsize=8)
-    figure.suptitle(
-        f"{TITLES.get(env, env)}: training actions (blue), validation (orange)", fontsize=9
-    )
+    name = TITLES.get(env, paper.TITLES.get(env, env))
+    figure.suptitle(f"{name}: training actions (blue), validation (orange)", fontsize=9)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
