@@ -633,8 +633,12 @@ def collect_run(run: Run, results_dir: Path) -> None:
     merge(results_dir / f"{file_of(run.env)}.csv", COLUMNS, scores, key)
     if run.method in ADAPT:
         merge(results_dir / "fig9_curves.csv", ADAPT_COLUMNS, adaptation_of(run), key[:3])
-    else:
-        merge(results_dir / f"{file_of(run.env)}_curves.csv", CURVE_COLUMNS, curve, key[:3])
+        return
+    path, last = results_dir / f"{file_of(run.env)}_curves.csv", int(curve[-1]["step"])
+    old = csv.DictReader(path.open()) if path.exists() else ()
+    same = [r for r in old if all(r[k] == str(curve[0][k]) for k in key[:3])]
+    if all(int(r["step"]) <= last for r in same):  # the longest run of a method is its curve
+        merge(path, CURVE_COLUMNS, curve, key[:3])
 
 
 def collect_test(test: Test, results_dir: Path) -> None:

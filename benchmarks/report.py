@@ -400,8 +400,8 @@ def adaptation(env: str) -> tuple[float | None, dict[str, list[tuple[int, float]
 def adaptation_table(experiment: str) -> str:
     """How many steps on the unseen actions it takes to reach what zero-shot has at once."""
     lines = [
-        "| environment | zero-shot | " + " | ".join(METHODS[m] for m in paper.ADAPT) + " |",
-        "|---" * (2 + len(paper.ADAPT)) + "|",
+        "| environment | zero-shot | " + " | ".join(METHODS[m] for m in paper.ADAPT) + " | seeds |",
+        "|---" * (3 + len(paper.ADAPT)) + "|",
     ]
     for env in paper.EXPERIMENTS[experiment].runs:
         line, curves = adaptation(env)
@@ -413,10 +413,11 @@ def adaptation_table(experiment: str) -> str:
             if line is None or method not in curves:
                 cells.append("-")
             elif steps:
-                cells.append(f"{steps[0] / 1e6:.2f}M")
+                cells.append(f"{steps[0]:,}")
             else:
-                cells.append(f"not reached in {curves[method][-1][0] / 1e6:.2f}M")
-        lines.append("| " + " | ".join(cells) + " |")
+                cells.append(f"not reached in {curves[method][-1][0]:,}")
+        rows = [r for r in read(RESULTS / "fig9_curves.csv") if r["env"] == env]
+        lines.append("| " + " | ".join([*cells, str(len({r["seed"] for r in rows}))]) + " |")
     return "\n".join(lines) + (
         "\n\nSteps until the training score, averaged over seeds and over a hundredth of the run, "
         "first exceeds the zero-shot score on the same set (all test actions at once)."
@@ -427,7 +428,7 @@ def adaptation_figure(experiment: str, path: Path) -> None:
     """Figure 9: one panel per environment, raw training scores and the zero-shot line."""
     data = {env: adaptation(env) for env in paper.EXPERIMENTS[experiment].runs}
     data = {env: found for env, found in data.items() if found[1]}
-    figure, axes = plt.subplots(1, len(data), figsize=(3 * len(data), 3), squeeze=False)
+    figure, axes = plt.subplots(1, len(data), figsize=(3 * len(data) + 2, 3), squeeze=False)
     for axis, (env, (line, curves)) in zip(axes.flat, data.items(), strict=True):
         for i, method in enumerate(paper.ADAPT):
             if method in curves:
@@ -438,7 +439,7 @@ def adaptation_figure(experiment: str, path: Path) -> None:
             axis.axhline(line, color="k", ls="--", lw=1, label="Ours, zero-shot")
         axis.set_title(paper.TITLES[env], fontsize=9)
         axis.set_xlabel("million steps", fontsize=8)
-    axes[0, 0].legend(frameon=False, fontsize=6)
+    axes[0, -1].legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     save(figure, path)
 
 
