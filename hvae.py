@@ -1065,6 +1065,7 @@ def probe(
         return r2_score(y[held_out_ids][:, keep], predicted)
 
     def within_classes(y: np.ndarray, group: np.ndarray) -> float:
+        """R^2 of one read-out per class of `group`: knowing the class alone is worth nothing."""
         missed = total = 0.0
         for name in set(group[held_out_ids]) - {""}:
             seen, new = (ids[group[ids] == name] for ids in (train_ids, held_out_ids))
