@@ -51,6 +51,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 import torch.distributed as dist
+import torch.distributed.nn  # now: see main(), where the processes part
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
@@ -1787,6 +1788,9 @@ def main() -> None:
         raise SystemExit(1 if RANK else f"error: {e}") from None
     finally:
         if dist.is_initialized():
+            # Ends gloo's threads, if nothing else holds the group: a thread that still frees a
+            # tensor while the interpreter ends aborts the process. `torch.distributed.nn` would
+            # hold it, as a default argument, if an optimizer were what imports it, after the start.
             dist.destroy_process_group()
 
 

@@ -499,13 +499,16 @@ def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path, mo
 
 
 JOINT = """
-import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
+import os, sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
 import torch, torch.distributed as dist
 import ppo_actiongen as ppo
 from test_ppo_actiongen import joint_update
 dist.init_process_group("gloo")
 name = f"{{ppo.RANK}}of{{ppo.WORLD_SIZE}}"
 torch.save(joint_update(ppo.RANK, ppo.WORLD_SIZE), {folder!r} + "/" + name)
+dist.destroy_process_group()
+threads = [open(f"/proc/self/task/{{i}}/comm").read() for i in os.listdir("/proc/self/task")]
+assert not any("gloo" in name for name in threads), threads  # they abort a process that ends first
 """
 
 
