@@ -39,7 +39,7 @@ METHODS = {
     "ours_no_subsampling": "w/o subsampling",
     "nearest_neighbor": "Nearest neighbour",
     "continuous_output": "Continuous output",
-    "ours_mlp_encoder": "Ours, MLP encoder",
+    "ours_lstm_encoder": "Ours, Bi-LSTM encoder",
     "ours_bilinear": "Ours, bilinear utility",
     "ours_video": "Ours, video",
     "ours_no_subgoal_reward": "No subgoal reward",
