@@ -583,7 +583,7 @@ def test_help_reads_like_the_tables():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("recipe", ["laptop", "quick"])
+@pytest.mark.parametrize("recipe", ["laptop", "quick", "lstm"])
 def test_recipe_equals_the_published_table(tmp_path, recipe, seed):
     """Probe scores of the released 10,000-epoch table, on a fresh encoder (minutes)."""
     args = Args(recipe=recipe, seed=seed, runs_dir=str(tmp_path), plots=False)
