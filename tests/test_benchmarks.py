@@ -61,7 +61,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
         ppo_actiongen.check(args)
         assert args.seed == args.split_seed == 3
         if not run.env.endswith("-recipe") and run.method not in (
-            "ours_lstm_encoder",
+            "ours_mlp_encoder",
             "ours_analysis",
         ):
             assert ppo_actiongen.method_name(args) == run.method, run.command
@@ -142,9 +142,10 @@ def test_merging_replaces_rows_of_the_same_key_and_keeps_the_rest(tmp_path):
     first = [dict(method="a", seed=s, score=0.5) for s in (0, 1)]
     paper.merge(path, columns, first, ("method", "seed"))
     paper.merge(path, columns, [dict(method="a", seed=1, score=0.75)], ("method", "seed"))
-    rows = list(csv.DictReader(path.open()))
+    paper.merge(path, columns, [dict(method="a", seed=0, score=0.25)], ("method", "seed"))
+    rows = sorted(csv.DictReader(path.open()), key=lambda row: row["seed"])
     assert rows == [
-        {"method": "a", "seed": "0", "score": "0.5"},
+        {"method": "a", "seed": "0", "score": "0.25"},
         {"method": "a", "seed": "1", "score": "0.75"},
     ]
     assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
@@ -188,6 +189,18 @@ def test_a_finished_adaptation_has_one_phase_and_a_curve(tmp_path):
 
 
 # ---- the report ----
+
+
+def test_the_budget_with_most_seeds_is_shown_then_the_largest(tmp_path, monkeypatch):
+    budgets = [("a", 0, 9), ("a", 0, 5), ("a", 1, 5), ("b", 0, 5), ("b", 0, 9)]
+    rows = [f"gridworld,{m},{seed},test,{steps}" for m, seed, steps in budgets]
+    text = "env,method,seed,phase,steps\n" + "\n".join(rows)
+    (tmp_path / "gridworld.csv").write_text(text)
+    monkeypatch.setattr(report, "RESULTS", tmp_path)
+    shown = report.scores("gridworld")
+    assert [(r["seed"], r["steps"]) for r in shown["a", "test"]] == [("0", "5"), ("1", "5")]
+    assert [(r["seed"], r["steps"]) for r in shown["b", "test"]] == [("0", "9")]
+    assert shown["c", "test"] == []
 
 
 def test_every_method_has_a_label():
