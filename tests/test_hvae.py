@@ -29,8 +29,9 @@ KINDS = {  # format and a raw batch (3 actions, 2 observations) of each kind of 
 
 
 def arguments(**changes):
-    """Resolved Args of Grid World; `changes` may set any field, also against the environment."""
-    args = hvae.resolve(Args(recipe=changes.pop("recipe", "laptop")))
+    """Resolved Args of Grid World with D.3.1's encoder; `changes` may set any field, also against
+    the environment."""
+    args = hvae.resolve(Args(recipe=changes.pop("recipe", "lstm")))
     for name, value in changes.items():
         setattr(args, name, value)
     return args
