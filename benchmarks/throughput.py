@@ -511,8 +511,8 @@ def hvae() -> Iterator[Row]:
     first = None
     for what, changes in (
         ("hvae: Bi-LSTM, paper width", dict(encoder="lstm", compact=False)),
-        ("hvae: Bi-LSTM, half width (recipe laptop)", dict(encoder="lstm")),
-        ("hvae: MLP encoder (recipe quick)", dict(encoder="mlp")),
+        ("hvae: Bi-LSTM, half width (recipe lstm)", dict(encoder="lstm")),
+        ("hvae: MLP encoder (recipes laptop, quick)", dict(encoder="mlp")),
     ):
         args = encoder.resolve(encoder.Args(**changes))
         raw = grid.action_observations(np.arange(128), 4, "xy")
