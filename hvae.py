@@ -192,7 +192,7 @@ SKILLS = dict(encoder="mlp", set_size=1024, kl_warmup=0.5)
 
 SPECIAL = {  # recipe and environment or modality -> what else is different there
     "laptop gridworld": SKILLS | dict(updates=6_000),
-    "quick gridworld": SKILLS | dict(updates=3_000),
+    "quick gridworld": SKILLS | dict(updates=4_500),
     "laptop create": CREATE | dict(updates=2_500),
     "quick create": CREATE | dict(updates=1_500),
     # 160 zeros and ones per state say the same as 2 numbers, and are learned later.
