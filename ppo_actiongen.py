@@ -57,6 +57,8 @@ import torch.nn.functional as F
 import tyro
 from tqdm import tqdm
 
+import hvae
+
 # Set by torchrun; without it one process does everything.
 RANK, WORLD_SIZE = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
 
@@ -395,10 +397,7 @@ class StateEncoder(nn.Module):
                 nn.init.kaiming_uniform_(conv.weight, a=math.sqrt(5), generator=generator)
                 bound = 1 / math.sqrt(conv.weight[0].numel())
                 nn.init.uniform_(conv.bias, -bound, bound, generator=generator)
-            # Half the time of a pass can go into pages of memory fresh from the system, so ReLU
-            # works in place, and a block of 31 MB is freed at once: from then on the C library
-            # (glibc) keeps blocks up to that size for the next use instead of handing them back.
-            torch.empty(31 << 20, dtype=torch.uint8)
+            # ReLU in place: one array less to write and read again.
             layers = (m for c in convs for m in (c, nn.ReLU(inplace=True)))
             self.conv = nn.Sequential(*layers, nn.Flatten())
             self.conv.to(memory_format=torch.channels_last)
@@ -533,6 +532,7 @@ class Agent(nn.Module):
 
     def __init__(self, state_space, action_space, table, train_ids, args: Args, workers: Workers):
         super().__init__()
+        hvae.keep_memory()  # for pictures; the other arrays are small enough to be kept anyway
         generator = torch.Generator().manual_seed(args.seed)
         self.method, self.aux_ent_scale, self.workers = args.method, args.aux_ent_scale, workers
         # torch.tensor copies into aligned memory: matrix products may round differently elsewhere.
@@ -793,8 +793,6 @@ def load_table(args: Args, train_ids: np.ndarray) -> np.ndarray:
         if "variant" in options and "variant" not in known:
             raise ValueError(f"representation {kind!r}: {args.env} has only 'engineered'")
     else:
-        import hvae  # only here: the recommender never needs it
-
         path = Path(kind)
         if kind in ("hvae", "hvae-all", "vae"):
             hvae_args = hvae.Args(

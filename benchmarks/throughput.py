@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the scripts live one level up
@@ -531,6 +532,46 @@ def hvae() -> Iterator[Row]:
         first = first or speed
         yield what, speed, "updates/s", "", "one thread"
         yield "  ratio to the paper width", speed / first, "x", "", "same process"
+    torch.set_num_threads(threads)
+    yield from hvae_pictures()
+
+
+def hvae_pictures() -> Iterator[Row]:
+    """Updates on viewpoints of shapes, 16 shapes x 4 pictures, one thread; plain form first."""
+    import ctypes
+
+    import numpy as np
+    import torch
+
+    import hvae as encoder
+    import stacking_env as stack
+
+    threads, handed_back, first = torch.get_num_threads(), 128 << 10, None
+    torch.set_num_threads(1)
+    raw = torch.from_numpy(stack.action_observations(np.arange(0, 800, 50), 4, "image"))
+    args = encoder.resolve(encoder.Args(env="stacking"))
+    fmt = encoder.Format.of("stacking", "image", raw.shape, False)
+    for what in ("hvae: pictures, plain form", "hvae: pictures, as trained"):
+        model = encoder.HVAE(fmt, args)
+        if first is None:  # glibc's default threshold, and PyTorch's default order in memory
+            with suppress(AttributeError, OSError, TypeError):
+                for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
+                    ctypes.CDLL(None).mallopt(option, handed_back)
+            model.to(memory_format=torch.contiguous_format)
+        else:
+            encoder.keep_memory()
+        optimiser = torch.optim.RAdam(model.parameters(), lr=1e-3, foreach=True)
+
+        def update(model=model, optimiser=optimiser) -> int:
+            optimiser.zero_grad()
+            model(raw)["loss"].backward()
+            optimiser.step()
+            return raw.shape[0] * raw.shape[1]
+
+        speed = rate(update, 5.0)
+        first = first or speed
+        yield what, speed, "pictures/s", "", "84 x 84, one thread"
+    yield "  ratio to the plain form", speed / first, "x", "", "same process"
     torch.set_num_threads(threads)
 
 

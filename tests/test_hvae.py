@@ -1,5 +1,6 @@
 """The HVAE against torch's distributions, the published layer sizes, and damaged files."""
 
+import ctypes
 import json
 import subprocess
 import sys
@@ -204,6 +205,31 @@ def test_representation_ignores_order_and_company_and_repeats(kind, encoder):
         assert mean.shape == log_var.shape == (3, 16) and torch.equal(mean, again)
         torch.testing.assert_close(mean, shuffled, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(mean[1:2], alone, rtol=1e-4, atol=1e-5)
+
+
+MEMORY = """
+import resource, sys, torch, hvae
+if sys.argv[1] == "keep":
+    hvae.keep_memory()
+def new_pages(times):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(times):
+        torch.ones(10_000_000)  # 40 MB: 9,765 pages of 4 kB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+new_pages(20)  # the library takes some turns to find places
+print(new_pages(10))
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="not glibc")
+def test_kept_memory_is_used_again():
+    """Without it, all pages of ten arrays, each freed before the next, are new."""
+
+    def new_pages(word: str) -> int:
+        command = [sys.executable, "-c", MEMORY, word]
+        return int(subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout)
+
+    assert new_pages("keep") < 30_000 and new_pages("default") > 90_000
 
 
 # ---- observations in and out ----
