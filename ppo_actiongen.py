@@ -303,7 +303,7 @@ FAST = {
     ),
     "stacking": dict(
         utility_gains=(1.0, math.sqrt(2), 0.01),
-        minibatch_size=256,  # rollouts of 32 steps
+        minibatch_size=32,  # rollouts of 4 steps: physics is the bill, so learn more from each one
         stop_bias=4.0,  # a fresh stop head ends episodes after two shapes, before any tower
         clip_vloss=False,
         lr_decay_steps=None,
