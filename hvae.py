@@ -202,7 +202,7 @@ SPECIAL = {  # recipe and environment or modality -> what else is different ther
     "quick onehot": dict(updates=2_500, encoder="mlp", set_size=64, kl_warmup=0.0),
     # Pictures cost a hundred times as much as grid trajectories.
     "laptop image": PICTURES | dict(updates=1_500),
-    "quick image": PICTURES | dict(updates=500),
+    "quick image": PICTURES | dict(updates=1_000),
     "laptop video": dict(observations=32, batch_observations=4, updates=1_000),
     "quick video": dict(observations=16, batch_observations=2, updates=200),
 }

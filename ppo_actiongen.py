@@ -317,7 +317,7 @@ QUICK = {
     "gridworld": dict(total_timesteps=4_000_000, hvae_recipe="quick"),
     "recsys": dict(total_timesteps=1_000_000),
     "create": dict(total_timesteps=400_000, hvae_recipe="quick", eval_episodes=500),
-    "stacking": dict(total_timesteps=40_000, hvae_recipe="quick", eval_episodes=200),
+    "stacking": dict(total_timesteps=60_000, hvae_recipe="quick", eval_episodes=500),
 }
 
 # Best score a policy of this kind can reach on (seen, unseen) actions, to read results by.
