@@ -12,6 +12,7 @@ import colorsys
 import csv
 import sys
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 from statistics import mean, pstdev
 
@@ -146,13 +147,20 @@ def runs_of(env: str, kind: str = "") -> list[dict]:
     return [r for r in read(RESULTS / f"{paper.file_of(env)}{kind}.csv") if r["env"] == env]
 
 
-def scores(env: str) -> dict[tuple[str, str], list[dict]]:
+def scores(env: str, methods: Iterable[str] = ()) -> dict[tuple[str, str], list[dict]]:
     """(method, phase) -> our rows, one per seed; of each method the budget with most seeds, then
-    the largest: means over other numbers of seeds, each its own split, would not compare."""
+    the largest: means over other numbers of seeds, each its own split, would not compare.
+
+    With `methods`, those to compare: if all of them were run with some budget, only that one."""
     table: dict = defaultdict(lambda: defaultdict(list))
     for r in runs_of(env):
         table[r["method"], r["phase"]][int(r["steps"])].append(r)
-    best = {k: max(v.items(), key=lambda b: (len(b[1]), b[0]))[1] for k, v in table.items()}
+    common = set.intersection(*(set(table[m, "test"]) for m in methods)) if methods else set()
+    best = {}
+    for key, budgets in table.items():
+        kept = {steps: rows for steps, rows in budgets.items() if steps in common or not common}
+        if kept:
+            best[key] = max(kept.items(), key=lambda b: (len(b[1]), b[0]))[1]
     return defaultdict(list, best)
 
 
@@ -281,7 +289,7 @@ def comparison(experiment: str) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for env, methods in shown(experiment).items():
-        ours, theirs = scores(env), published(env)
+        ours, theirs = scores(env, methods), published(env)
         for method in methods:
             cells = [paper.TITLES[env], label(method, experiment)]
             for phase in ("train", "test"):
@@ -321,7 +329,7 @@ def panel_figure(experiment: str, path: Path) -> None:
         lines, columns, figsize=(width * columns, 3.4 * lines), squeeze=False
     )
     for axis, (env, methods) in zip(axes.flat, found.items(), strict=False):
-        ours, theirs = scores(env), published(env)
+        ours, theirs = scores(env, methods), published(env)
         for x, method in enumerate(methods):
             for at, phase, alpha in ((x - 0.2, "train", 0.35), (x + 0.2, "test", 0.9)):
                 values = [float(r["score"]) for r in ours[method, phase]]
