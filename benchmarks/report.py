@@ -12,7 +12,7 @@ import colorsys
 import csv
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, pstdev
 
@@ -147,20 +147,19 @@ def runs_of(env: str, kind: str = "") -> list[dict]:
     return [r for r in read(RESULTS / f"{paper.file_of(env)}{kind}.csv") if r["env"] == env]
 
 
-def scores(env: str, methods: Iterable[str] = ()) -> dict[tuple[str, str], list[dict]]:
+def scores(env: str, methods: Sequence[str] = ()) -> dict[tuple[str, str], list[dict]]:
     """(method, phase) -> our rows, one per seed; of each method the budget with most seeds, then
     the largest: means over other numbers of seeds, each its own split, would not compare.
 
-    With `methods`, those to compare: if all of them were run with some budget, only that one."""
+    With `methods`, those to compare: one budget that all of them have, chosen alike, if any."""
     table: dict = defaultdict(lambda: defaultdict(list))
     for r in runs_of(env):
         table[r["method"], r["phase"]][int(r["steps"])].append(r)
     common = set.intersection(*(set(table[m, "test"]) for m in methods)) if methods else set()
-    best = {}
-    for key, budgets in table.items():
-        kept = {steps: rows for steps, rows in budgets.items() if steps in common or not common}
-        if kept:
-            best[key] = max(kept.items(), key=lambda b: (len(b[1]), b[0]))[1]
+    if common:
+        one = max(common, key=lambda n: (sum(len(table[m, "test"][n]) for m in methods), n))
+        return defaultdict(list, {key: v[one] for key, v in table.items() if one in v})
+    best = {k: max(v.items(), key=lambda b: (len(b[1]), b[0]))[1] for k, v in table.items() if v}
     return defaultdict(list, best)
 
 
