@@ -325,7 +325,7 @@ def panel_figure(experiment: str, path: Path) -> None:
     lines = -(-len(found) // columns)
     width = max(3.2, 0.5 * max(map(len, found.values())) + 1)
     figure, axes = plt.subplots(
-        lines, columns, figsize=(width * columns, 3.4 * lines), squeeze=False
+        lines, columns, figsize=(max(5, width * columns), 3.4 * lines), squeeze=False
     )
     for axis, (env, methods) in zip(axes.flat, found.items(), strict=False):
         ours, theirs = scores(env, methods), published(env)
