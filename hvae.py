@@ -741,7 +741,8 @@ def keep_memory() -> None:
 
     By default, what lies in a large array goes back to the system as soon as the array is freed,
     and the next one gets new pages, which the system clears one by one. An update on pictures makes
-    dozens of arrays of 30 MB: with new pages for each it takes about twice the time.
+    dozens of arrays of 30 MB. What that costs depends on the machine and its load
+    (benchmarks/throughput.py hvae: the plain form hands memory back).
     """
     M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, most = -1, -3, 2**31 - 1  # malloc.h; the largest C int
     with suppress(AttributeError, OSError, TypeError):  # another system's library has no mallopt
