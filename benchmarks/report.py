@@ -552,7 +552,7 @@ def encoder_table(experiment: str) -> str:
         cells = [
             f"{float(of[p]['value']):.3f}"
             + (f" ({float(of[p]['published']):.3f})" if of[p]["published"] else "")
-            if p in of
+            if p in of and of[p]["value"] != "nan"  # where all of them have the same value
             else "-"
             for p in panels
         ]
