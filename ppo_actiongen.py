@@ -615,9 +615,15 @@ class Agent(nn.Module):
         return self.head_mean(code), F.softplus(self.head_var(code)).sqrt()
 
     def nearest(self, wish, available):
-        """Slot of the action on offer whose representation is nearest: (B, D), (B, K) -> (B,)."""
-        offered = self.table[available]  # (B, K, D)
-        return (offered - wish[:, None]).square().sum(-1).argmin(1)
+        """Slot of the action on offer whose representation is nearest: (B, D), (B, K) -> (B,).
+
+        |c - w|^2 = |c|^2 - 2 c.w + |w|^2, and the last term is the same for every action. The rest
+        is one matrix product for the whole table, in double precision because it subtracts nearly
+        equal numbers; the (B, K, D) array of differences never exists.
+        """
+        table = self.table.double()
+        distance = table.square().sum(1) - 2 * wish.double() @ table.T  # (B, D) @ (D, A) -> (B, A)
+        return distance.gather(1, available).argmin(1)  # (B, K) -> (B,)
 
     def auxiliary(self, code, noise=None, action=None, taken=None):
         """f_chi: position ~ Beta on [-1, 1] per dimension, stop ~ Categorical(2).

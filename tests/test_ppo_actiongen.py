@@ -202,6 +202,16 @@ def test_nearest_neighbour_maps_the_training_action_to_the_nearest_on_offer():
         assert slot == int(np.argmin(distances))
 
 
+def test_nearest_is_exact_far_from_the_origin():
+    agent, _ = make_agent(method="continuous")
+    agent.table += 1000  # squares near 1e6 for distances near 1: float32 products would lose them
+    rng, (A, D) = torch.Generator().manual_seed(0), agent.table.shape
+    sets = torch.stack([torch.randperm(A, generator=rng)[:8] for _ in range(200)])
+    wish = agent.table[sets[:, 3]] + 0.3 * torch.randn(200, D, generator=rng)
+    direct = (agent.table[sets] - wish[:, None]).square().sum(-1).argmin(1)  # (B, K, D) -> (B,)
+    assert torch.equal(agent.nearest(wish, sets), direct)
+
+
 # ---- PPO's arithmetic ----
 
 
