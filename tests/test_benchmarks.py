@@ -201,6 +201,7 @@ def test_the_budget_with_most_seeds_is_shown_then_the_largest(tmp_path, monkeypa
     assert [(r["seed"], r["steps"]) for r in shown["a", "test"]] == [("0", "5"), ("1", "5")]
     assert [(r["seed"], r["steps"]) for r in shown["b", "test"]] == [("0", "9")]
     assert shown["c", "test"] == []
+    assert [r["steps"] for r in report.longest("gridworld")["a", "test"]] == ["9"]
     both = report.scores("gridworld", ["a", "b"])  # compared: the largest budget of both
     assert {r["steps"] for rows in both.values() for r in rows} == {"5"}
     assert len(both["a", "test"]) == 2
