@@ -350,6 +350,8 @@ def panel_figure(experiment: str, path: Path) -> None:
                     axis.bar(at, m, 0.4, yerr=s, fill=False, edgecolor="0.35", capsize=2)
         if env in ppo_actiongen.CEILINGS:
             axis.axhline(ppo_actiongen.CEILINGS[env][1], color="grey", lw=1)
+        middle, half = (len(methods) - 1) / 2, max(len(methods), 4) / 2 + 0.2
+        axis.set_xlim(middle - half, middle + half)  # one method is a bar, not a wall
         names = [label(m, experiment) for m in methods]
         axis.set_xticks(range(len(methods)), names, rotation=35, ha="right", fontsize=8)
         axis.set_title(paper.TITLES[env], fontsize=9)
@@ -521,7 +523,9 @@ def analysis_figure(experiment: str, path: Path) -> None:
     """One panel per environment; ours in colour, published in grey."""
     found, (_, title, name) = analysed(experiment), ANALYSES[experiment]
     envs = list(dict.fromkeys(env for env, _ in found))
-    figure, axes = plt.subplots(1, len(envs), figsize=(3.4 * len(envs), 3.2), squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(envs), figsize=(max(4.8, 3.4 * len(envs)), 3.4), squeeze=False
+    )
     for axis, env in zip(axes.flat, envs, strict=True):
         # The published distances belong to another table of representations: an axis of their own.
         theirs = axis.twiny() if name == "emb" else axis
@@ -543,7 +547,14 @@ def analysis_figure(experiment: str, path: Path) -> None:
         axis.set_xlabel(title, fontsize=8)
         axis.set_title(paper.TITLES[env], fontsize=9)
         axis.set_ylim(0, None)
-    axes[0, 0].legend(frameon=False, fontsize=6)
+        handles = axis.get_legend_handles_labels()
+        if theirs is not axis:
+            theirs.set_xlabel("published: squared distance of their representations", fontsize=8)
+            handles = [
+                a + b for a, b in zip(handles, theirs.get_legend_handles_labels(), strict=True)
+            ]
+        if axis is axes[0, 0]:
+            axis.legend(*handles, frameon=False, fontsize=6)
     save(figure, path)
 
 
