@@ -147,14 +147,20 @@ def runs_of(env: str, kind: str = "") -> list[dict]:
     return [r for r in read(RESULTS / f"{paper.file_of(env)}{kind}.csv") if r["env"] == env]
 
 
+def by_budget(env: str) -> dict[tuple[str, str], dict[int, list[dict]]]:
+    """(method, phase) -> steps -> our rows, one per seed."""
+    table: dict = defaultdict(lambda: defaultdict(list))
+    for r in runs_of(env):
+        table[r["method"], r["phase"]][int(r["steps"])].append(r)
+    return table
+
+
 def scores(env: str, methods: Sequence[str] = ()) -> dict[tuple[str, str], list[dict]]:
     """(method, phase) -> our rows, one per seed; of each method the budget with most seeds, then
     the largest: means over other numbers of seeds, each its own split, would not compare.
 
     With `methods`, those to compare: one budget that all of them have, chosen alike, if any."""
-    table: dict = defaultdict(lambda: defaultdict(list))
-    for r in runs_of(env):
-        table[r["method"], r["phase"]][int(r["steps"])].append(r)
+    table = by_budget(env)
     common = set.intersection(*(set(table[m, "test"]) for m in methods)) if methods else set()
     if common:
         one = max(common, key=lambda n: (sum(len(table[m, "test"][n]) for m in methods), n))
@@ -165,9 +171,7 @@ def scores(env: str, methods: Sequence[str] = ()) -> dict[tuple[str, str], list[
 
 def longest(env: str) -> dict[tuple[str, str], list[dict]]:
     """(method, phase) -> our rows of the method's largest budget, however few their seeds."""
-    found: dict = defaultdict(lambda: defaultdict(list))
-    for r in runs_of(env):
-        found[r["method"], r["phase"]][int(r["steps"])].append(r)
+    found = by_budget(env)
     return defaultdict(list, {key: v[max(v)] for key, v in found.items()})
 
 
