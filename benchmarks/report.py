@@ -201,9 +201,11 @@ def table(env: str) -> str:
         hours = mean(float(r["hours"]) for r in rows)
         cells += [str(len(rows)), f"{int(rows[0]['steps']) / 1e6:.1f}M", f"{hours:.2f}"]
         lines.append("| " + " | ".join(cells) + " |")
+    # Stacking's environments are processes of their own: physics takes every core there is.
+    cores = "two CPU cores" if env == "stacking" else "one CPU core"
     note = f"Ceiling: {ceiling[1]}{phases.format(*ceiling)}. " if ceiling else ""
     lines.append(
-        f"\n{note}± is the standard deviation over seeds; hours are per seed on one CPU core. "
+        f"\n{note}± is the standard deviation over seeds; hours are per seed on {cores}. "
         f"Command: `python benchmarks/paper.py {env}`; every row's own command is in "
         f"`results/{paper.file_of(env)}.csv`."
     )
