@@ -341,6 +341,21 @@ def test_fast_convolutions_equal_the_plain_ones(channels):
     assert (near_grad - grad).norm() / grad.norm() < 10 / 512 and cosine(near_grad, grad) > 0.9999
 
 
+def test_initial_encoder_tells_pictures_apart_only_with_a_gain():
+    """What differs between two pictures is in the code from the start, not a thousandth of it."""
+    space = gym.spaces.Box(0, 255, (3, 84, 84), np.uint8)
+    state = torch.full((16, 84, 84, 3), 255, dtype=torch.uint8)
+    for i in range(16):  # white, and one black square of 20 x 20 pixels somewhere
+        y, x = 20 * (i // 4), 20 * (i % 4)
+        state[i, y : y + 20, x : x + 20] = 0
+    spread = {}
+    for gain in (None, math.sqrt(2)):
+        agent, _ = make_agent(HYBRID, space, conv_gain=gain)
+        with torch.no_grad():
+            spread[gain] = agent.encoder(state)[0].std(dim=0).mean()
+    assert spread[None] < 0.005 and spread[math.sqrt(2)] > 0.05
+
+
 def gradient_of_update(agent, args, batch):
     """What one minibatch's update subtracts from the parameters at learning rate 1."""
     before = parameter_vector(agent)
