@@ -105,6 +105,12 @@ RUNS: dict[str, dict[str, str]] = {
         "utility_width_64": "gridworld --representation engineered --utility-hidden 64",
         "gains_0.01": "gridworld --representation engineered --utility-gains 0.01 0.01 0.01",
     },
+    "create-recipe": {
+        "fast": "create",
+        "conv_default": "create --conv-gain None",
+        "value_coefficient_0.5": "create --vf-coef 0.5",
+        "minibatch_3072": "create --minibatch-size 3072",
+    },
     "recsys": {
         "ours": "recsys --utility mlp",
         "ours_no_entropy": "recsys --utility mlp --ent-coef 0",
@@ -166,10 +172,12 @@ def main_tasks(*methods: str) -> dict[str, tuple[str, ...]]:
     return {f"create-{task}": methods for task in MAIN_TASKS}
 
 
+RECIPES = ("gridworld-recipe", "create-recipe")
 MAIN = ["gridworld", "recsys", *(f"create-{task}" for task in MAIN_TASKS), "stacking"]
 TITLES = {
     "gridworld": "Grid World",
     "gridworld-recipe": "Grid World: what each difference of the fast recipe is worth",
+    "create-recipe": "CREATE push: what each difference of the fast recipe is worth",
     "recsys": "Recommender, partially observable",
     "recsys-full": "Recommender, fully observable",
     **{f"create-{task}": f"CREATE {task}" for task in MAIN_TASKS + MORE_TASKS},
@@ -180,7 +188,7 @@ ANALYSIS = f"{EVALUATE} --num-available 50"  # Table 3
 
 EXPERIMENTS: dict[str, Experiment] = {
     name: Experiment(TITLES[name], {name: methods_of(name)})
-    for name in ("gridworld", "gridworld-recipe", "recsys", "recsys-full", *MAIN[2:])
+    for name in ("gridworld", *RECIPES, "recsys", "recsys-full", *MAIN[2:])
 }
 EXPERIMENTS |= {
     "table-main": Experiment(
@@ -480,7 +488,9 @@ def make_test(experiment: str, run: Run, options: str, args: Args) -> Test:
     options = options.replace("{pool}", str(TEST_ACTIONS[run.words[0]]))
     flags = {}  # flag -> value; later ones win
     for text in (options, args.extra_test):
-        words = shlex.split(text)
+        words = shlex.split(text.replace("=", " "))
+        if len(words) % 2:
+            raise ValueError(f"--extra-test {text!r}: every option needs a value")
         flags |= dict(zip(words[::2], words[1::2], strict=True))
     words = [word for pair in flags.items() for word in pair]
     return Test(experiment, run, ["evaluate", str(run.folder), *words, "--save"])

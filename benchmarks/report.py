@@ -69,33 +69,53 @@ TITLES = {
 }
 BAR_KEY = "filled: this repository (dots: seeds)   outlined: published   line: ceiling"
 
-RECIPES = ("gridworld-recipe",)
-
-# The differences of the fast recipe: what is undone in each row of "gridworld-recipe".
+# The differences of the fast recipe: what is undone in each row of "<environment>-recipe", and what
+# the recipe does instead.
 RECIPE = {
-    "fast": ("none: the fast recipe", ""),
-    "gains_0.01": (
-        "gains 0.01 in all three utility layers",
-        "1, sqrt 2, 0.01: a product of three small layers starves its own gradient",
-    ),
-    "numbers_not_one_hot": (
-        "cell ids as normalised numbers",
-        "one-hot: ids are names, not quantities",
-    ),
-    "minibatch_4096": (
-        "minibatches of 4,096",
-        "512: eight times as many updates from the same steps",
-    ),
-    "utility_width_64": ("utility of width 64", '128: "left of the river after three moves"'),
-    "train_with_50": (
-        "50 skills on offer in training",
-        "20: favourites are rarer, so more skills get practice; cheaper too",
-    ),
-    "not_standardized": ("representations as they come", "mean 0, std 1 over training actions"),
-    "entropy_constant": (
-        "constant entropy coefficient",
-        "decays to a tenth: one stray sample ends an episode in lava",
-    ),
+    "gridworld-recipe": {
+        "fast": ("none: the fast recipe", ""),
+        "gains_0.01": (
+            "gains 0.01 in all three utility layers",
+            "1, sqrt 2, 0.01: a product of three small layers starves its own gradient",
+        ),
+        "numbers_not_one_hot": (
+            "cell ids as normalised numbers",
+            "one-hot: ids are names, not quantities",
+        ),
+        "minibatch_4096": (
+            "minibatches of 4,096",
+            "512: eight times as many updates from the same steps",
+        ),
+        "utility_width_64": ("utility of width 64", '128: "left of the river after three moves"'),
+        "train_with_50": (
+            "50 skills on offer in training",
+            "20: favourites are rarer, so more skills get practice; cheaper too",
+        ),
+        "not_standardized": ("representations as they come", "mean 0, std 1 over training actions"),
+        "entropy_constant": (
+            "constant entropy coefficient",
+            "decays to a tenth: one stray sample ends an episode in lava",
+        ),
+    },
+    "create-recipe": {
+        "fast": ("none: the fast recipe", ""),
+        "conv_default": (
+            "convolutions as PyTorch initialises them",
+            "orthogonal, gain sqrt 2: else the code hardly tells two pictures apart at first",
+        ),
+        "value_coefficient_0.5": (
+            "value coefficient 0.5",
+            "0.02: goals are worth 10, and critic and policy share the convolutions",
+        ),
+        "minibatch_3072": (
+            "minibatches of 3,072",
+            "256: twelve times as many updates from the same steps",
+        ),
+    },
+}
+RECIPE_NOTE = {
+    "gridworld-recipe": "Engineered representation",
+    "create-recipe": "Learned representation",
 }
 
 
@@ -219,15 +239,15 @@ def recipe_table(env: str) -> str:
         "| undone | what the recipe does | seen | validation | unseen |",
         "|---|---|---|---|---|",
     ]
-    for method in [m for m in RECIPE if (m, "test") in ours]:
-        cells = list(RECIPE[method])
+    for method in [m for m in RECIPE[env] if (m, "test") in ours]:
+        cells = list(RECIPE[env][method])
         for phase in ("train", "valid", "test"):
             cells.append(f"{mean(float(r['score']) for r in ours[method, phase]):.3f}")
         lines.append("| " + " | ".join(cells) + " |")
     rows = ours["fast", "test"]
     steps = int(rows[0]["steps"]) / 1e6
     lines.append(
-        f"\nEngineered representation, {steps:.1f}M steps, {len(rows)} seed(s): early in learning, "
+        f"\n{RECIPE_NOTE[env]}, {steps:.1f}M steps, {len(rows)} seed(s): early in learning, "
         f"where its speed shows. Command: `python benchmarks/paper.py {env}`."
     )
     return "\n".join(lines)
@@ -639,7 +659,7 @@ def has_results(experiment: str) -> bool:
 
 def draw(experiment: str) -> list[Path]:
     """Draw an experiment's pictures; the paths of what was drawn."""
-    if not has_results(experiment) or experiment in RECIPES:
+    if not has_results(experiment) or experiment in paper.RECIPES:
         return []
     path, kind = RESULTS / f"{experiment}.png", paper.EXPERIMENTS[experiment]
     if kind.encoders:
@@ -666,7 +686,7 @@ def section(experiment: str) -> str:
     """What stands between an experiment's markers in README.md; "" without results."""
     if not has_results(experiment):
         return ""
-    if experiment in RECIPES:
+    if experiment in paper.RECIPES:
         return recipe_table(experiment)
     kind = paper.EXPERIMENTS[experiment]
     if experiment in kind.runs:

@@ -38,7 +38,7 @@ def test_dry_run_lists_every_figure_and_analysis_and_each_command_once(tmp_path)
     command += ["--runs-dir", str(tmp_path)]  # nothing is finished there
     out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr
-    for name in (*FIGURES, *ANALYSES, "table-main", "table-full-split", "gridworld-recipe"):
+    for name in (*FIGURES, *ANALYSES, "table-main", "table-full-split", *paper.RECIPES):
         assert f"\n{name}: " in out.stdout, name
     for name, experiment in paper.EXPERIMENTS.items():
         assert experiment.runs or experiment.encoders, name
@@ -209,10 +209,10 @@ def test_the_budget_with_most_seeds_is_shown_then_the_largest(tmp_path, monkeypa
 
 
 def test_every_method_has_a_label():
-    assert {m for env, ms in paper.RUNS.items() if env != "gridworld-recipe" for m in ms} <= set(
-        report.METHODS
-    )
-    assert set(paper.RUNS["gridworld-recipe"]) == set(report.RECIPE)
+    for env, methods in paper.RUNS.items():
+        labels = report.RECIPE[env] if env in paper.RECIPES else report.METHODS
+        assert set(methods) <= set(labels)
+    assert set(report.RECIPE) == set(report.RECIPE_NOTE) == set(paper.RECIPES)
 
 
 def test_published_scores_are_found():
