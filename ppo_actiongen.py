@@ -1250,7 +1250,7 @@ def plot_curve(metrics: Path, path: Path, metric: str, published: dict, ceiling)
 
 @torch.no_grad()
 def record_episode(agent, preprocess, args: Args, pool, path: Path) -> None:
-    """Play one episode with unseen actions and save it as a GIF (the best of a few, by return)."""
+    """Play with unseen actions and save an episode as a GIF: the best of 20, by return."""
     module = importlib.import_module(MODULES[args.env])
     names = {"gridworld": "GridWorldEnv", "recsys": "RecSysEnv"}
     make = getattr(module, names.get(args.env, args.env.capitalize() + "Env"))
@@ -1258,23 +1258,28 @@ def record_episode(agent, preprocess, args: Args, pool, path: Path) -> None:
     env = make(pool, K, render_mode="rgb_array", **task_options(args))
     device, P = agent.table.device, agent.project_actions()
     generator = torch.Generator(device).manual_seed(args.seed)
-    best = (-math.inf, [])
-    for attempt in range(5):
-        obs, _ = env.reset(seed=10_000 + args.seed + attempt)
-        frames, done, total = [env.render()], False, 0.0
+    best = (-math.inf, 0, [])  # return, seed, actions
+    for attempt in range(20):
+        seed, actions, done, total = 10_000 + args.seed + attempt, [], False, 0.0
+        obs, _ = env.reset(seed=seed)
         while not done:
             state = preprocess(obs["state"][None]).to(device)  # (1, ...)
             available = torch.as_tensor(obs["available"])[None].to(device)  # (1, K)
             action, *_ = agent.act(state, available, P, generator)
             parts = to_env(action)
-            one = {k: v[0] for k, v in parts.items()} if isinstance(parts, dict) else parts[0]
-            obs, reward, terminated, truncated, _ = env.step(one)
-            frames += env.render_frames()
+            actions.append({k: v[0] for k, v in parts.items()} if type(parts) is dict else parts[0])
+            obs, reward, terminated, truncated, _ = env.step(actions[-1])
             total, done = total + reward, terminated or truncated
         if total > best[0]:
-            best = (total, frames)
+            best = (total, seed, actions)
+    # The same seed and actions again, now with pictures: these take most of the time.
+    env.reset(seed=best[1])
+    frames = [env.render()]
+    for action in best[2]:
+        env.step(action)
+        frames += env.render_frames()
     env.close()
-    module.save_gif(path, best[1], fps=env.metadata["render_fps"])
+    module.save_gif(path, frames, fps=env.metadata["render_fps"])
 
 
 def print_table(results: dict, metric: str) -> None:
