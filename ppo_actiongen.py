@@ -1319,6 +1319,11 @@ def check(args: Args) -> None:
         )
     if args.micro_batch < 0:
         raise ValueError(f"micro_batch {args.micro_batch} is not allowed; at least 0")
+    for name, value in vars(args).items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{name} {value} is not a finite number")
+    if args.conv_gain is not None and args.conv_gain <= 0:
+        raise ValueError(f"conv_gain {args.conv_gain} is not above 0 (or None)")
     if args.ent_coef < 0 or args.learning_rate <= 0:
         raise ValueError("ent_coef must be at least 0 and learning_rate above 0")
     if args.task is not None and "task" not in TASK_OPTIONS.get(args.env, ()):

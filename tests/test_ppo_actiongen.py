@@ -639,6 +639,8 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
     [
         (["--num-available", "0"], "num_available 0"),
         (["--num-available", "600"], "600 is more than the 512"),
+        (["--conv-gain", "-1"], "conv_gain -1.0 is not above 0"),
+        (["--vf-coef", "nan"], "vf_coef nan is not a finite number"),
         (["--total-timesteps", "-5"], "total_timesteps -5"),
         (["--total-timesteps", "10"], "less than one rollout of 256"),
         (["--representation", "nonsense"], "'nonsense'"),
