@@ -11,7 +11,7 @@ Bars: our mean over seeds, filled; published mean, outlined; dots: our seeds; li
 import colorsys
 import csv
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, pstdev
@@ -162,6 +162,11 @@ def spread(values: list[float], digits: int = 3) -> str:
     return f"{mean(values):.{digits}f}{deviation}"
 
 
+def millions(rows: list[dict]) -> str:
+    """The number of steps of these rows, as the tables write it: 10M, 0.04M."""
+    return f"{round(int(rows[0]['steps']) / 1e6, 2):g}M"
+
+
 def runs_of(env: str, kind: str = "") -> list[dict]:
     """Rows of one environment: of its runs, or with kind "_curves" of their learning curves."""
     return [r for r in read(RESULTS / f"{paper.file_of(env)}{kind}.csv") if r["env"] == env]
@@ -177,7 +182,8 @@ def by_budget(env: str) -> dict[tuple[str, str], dict[int, list[dict]]]:
 
 def scores(env: str, methods: Sequence[str] = ()) -> dict[tuple[str, str], list[dict]]:
     """(method, phase) -> our rows, one per seed; of each method the budget with most seeds, then
-    the largest: means over other numbers of seeds, each its own split, would not compare.
+    that of most methods, then the largest: rows of other numbers of seeds, each its own split, or
+    of other numbers of steps would not compare.
 
     With `methods`, those to compare: one budget that all of them have, chosen alike, if any."""
     table = by_budget(env)
@@ -185,7 +191,12 @@ def scores(env: str, methods: Sequence[str] = ()) -> dict[tuple[str, str], list[
     if common:
         one = max(common, key=lambda n: (sum(len(table[m, "test"][n]) for m in methods), n))
         return defaultdict(list, {key: v[one] for key, v in table.items() if one in v})
-    best = {k: max(v.items(), key=lambda b: (len(b[1]), b[0]))[1] for k, v in table.items() if v}
+    shared = Counter(steps for v in table.values() for steps in v)  # budget -> methods and phases
+    best = {
+        k: max(v.items(), key=lambda b: (len(b[1]), shared[b[0]], b[0]))[1]
+        for k, v in table.items()
+        if v
+    }
     return defaultdict(list, best)
 
 
@@ -219,7 +230,7 @@ def table(env: str) -> str:
             cells.append(f"{known[0]:.3f} ± {known[1]:.3f}" if known else "-")
         rows = of[method, "test"]
         hours = mean(float(r["hours"]) for r in rows)
-        cells += [str(len(rows)), f"{int(rows[0]['steps']) / 1e6:.1f}M", f"{hours:.2f}"]
+        cells += [str(len(rows)), millions(rows), f"{hours:.2f}"]
         lines.append("| " + " | ".join(cells) + " |")
     # Stacking's environments are processes of their own: physics takes every core there is.
     cores = "two CPU cores" if env == "stacking" else "one CPU core"
@@ -245,9 +256,8 @@ def recipe_table(env: str) -> str:
             cells.append(f"{mean(float(r['score']) for r in ours[method, phase]):.3f}")
         lines.append("| " + " | ".join(cells) + " |")
     rows = ours["fast", "test"]
-    steps = int(rows[0]["steps"]) / 1e6
     lines.append(
-        f"\n{RECIPE_NOTE[env]}, {steps:.1f}M steps, {len(rows)} seed(s): early in learning, "
+        f"\n{RECIPE_NOTE[env]}, {millions(rows)} steps, {len(rows)} seed(s): early in learning, "
         f"where its speed shows. Command: `python benchmarks/paper.py {env}`."
     )
     return "\n".join(lines)
@@ -334,15 +344,18 @@ def comparison(experiment: str) -> str:
                 cells.append(text if phase == "train" else f"**{text}**")
                 cells.append(f"{known[0]:.3f} ± {known[1]:.3f}" if known else "-")
             rows = ours[method, "test"]
-            cells += [str(len(rows)), f"{int(rows[0]['steps']) / 1e6:.2f}M"]
+            cells += [str(len(rows)), millions(rows)]
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def overview(experiment: str) -> str:
     """The main results: methods down, environments across, unseen actions only."""
-    found = shown(experiment)
-    lines = ["| method | " + " | ".join(paper.TITLES[env] for env in found) + " |"]
+    found, titles = shown(experiment), []
+    for env in found:
+        steps = Counter(millions(rows) for rows in scores(env).values())
+        titles.append(f"{paper.TITLES[env]}, {steps.most_common(1)[0][0]} steps")
+    lines = ["| method | " + " | ".join(titles) + " |"]
     lines.append("|---" * (1 + len(found)) + "|")
     for method in [m for m in METHODS if any(m in methods for methods in found.values())]:
         cells = [METHODS[method]]
@@ -352,7 +365,7 @@ def overview(experiment: str) -> str:
             text = spread(values) if method in methods else "-"
             cells.append(text + (f" ({known[0]:.3f})" if known else ""))
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n\nUnseen actions; in brackets: published."
+    return "\n".join(lines) + "\n\nUnseen actions; in brackets: published (more steps, see below)."
 
 
 def panel_figure(experiment: str, path: Path) -> None:

@@ -206,6 +206,11 @@ def test_the_budget_with_most_seeds_is_shown_then_the_largest(tmp_path, monkeypa
     assert {r["steps"] for rows in both.values() for r in rows} == {"5"}
     assert len(both["a", "test"]) == 2
     assert report.scores("gridworld", ["a", "c"]) == report.scores("gridworld")  # none in common
+    # With equally many seeds, the budget that most methods have: longer runs of one do not compare.
+    rows = [f"stacking,{m},0,test,{steps}" for m, steps in (("a", 4), ("a", 9), ("b", 4))]
+    (tmp_path / "stacking.csv").write_text("env,method,seed,phase,steps\n" + "\n".join(rows))
+    assert [r["steps"] for r in report.scores("stacking")["a", "test"]] == ["4"]
+    assert [r["steps"] for r in report.longest("stacking")["a", "test"]] == ["9"]
 
 
 def test_every_method_has_a_label():
