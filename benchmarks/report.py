@@ -41,6 +41,7 @@ METHODS = {
     "nearest_neighbor": "Nearest neighbour",
     "continuous_output": "Continuous output",
     "ours_mlp_encoder": "Ours, MLP encoder",
+    "ours_wide": "Ours, linear path, wide",
     "ours_bilinear": "Ours, bilinear utility",
     "ours_video": "Ours, video",
     "ours_no_subgoal_reward": "No subgoal reward",

@@ -191,11 +191,16 @@ def test_gradient_reaches_every_parameter(kind, model):
     assert not idle
 
 
-@pytest.mark.parametrize("encoder", ["lstm", "mlp"])
+@pytest.mark.parametrize("encoder", ["lstm", "mlp", "linear path"])
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_representation_ignores_order_and_company_and_repeats(kind, encoder):
+    changes = dict(encoder=encoder)
+    if encoder == "linear path":
+        if kind in ("image", "video"):
+            return  # refused, see below
+        changes = dict(encoder="mlp", linear_path=True)
     for model_class in (HVAE, VAE):
-        model, raw = small(kind, model_class, encoder=encoder)
+        model, raw = small(kind, model_class, **changes)
         model.eval()
         with torch.no_grad():
             mean, log_var = model.represent(raw)
@@ -205,6 +210,28 @@ def test_representation_ignores_order_and_company_and_repeats(kind, encoder):
         assert mean.shape == log_var.shape == (3, 16) and torch.equal(mean, again)
         torch.testing.assert_close(mean, shuffled, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(mean[1:2], alone, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["xy", "onehot"])
+def test_linear_path_is_a_linear_map_of_the_averaged_observations(kind):
+    model, raw = small(kind, linear_path=True)
+    plain, _ = small(kind)
+    assert plain.q_c.linear is None and plain.encoder.numbers == 0
+    model.eval()
+    with torch.no_grad():
+        model.q_c.norm.norm.bias.fill_(0.25)
+        last = model.q_c.after[-1]
+        both = model.represent(raw)[0]
+        last.weight.zero_()
+        last.bias.zero_()
+        mean, log_var = model.represent(raw)
+        inputs = hvae.prepare(raw.flatten(0, 1), model.format)[0].flatten(1)  # (A * n, numbers)
+        average = inputs.unflatten(0, raw.shape[:2]).mean(1)  # (A, numbers)
+        weight, bias = model.q_c.linear.weight, model.q_c.linear.bias
+        scale = 1 / np.sqrt(1 + hvae.BN_EPS)  # of a batch norm that has seen nothing yet
+    assert not torch.allclose(both, mean)  # the networks have their share
+    torch.testing.assert_close(mean, (average @ weight.T + bias) * scale + 0.25)
+    assert torch.equal(log_var, torch.full_like(log_var, 0.25))  # it is the networks' alone
 
 
 MEMORY = """
@@ -311,7 +338,8 @@ def test_short_training_learns_unseen_skills_and_never_sees_them(tmp_path, monke
     table = hvae.load_representation(path, "gridworld")
     assert table["mean"].shape == (1024, 16) and np.array_equal(table["action_ids"], TRAIN)
     weights = torch.load(path.with_suffix(".pt"))
-    model = HVAE(Format.of("gridworld", "xy", (6, 2), True), arguments(encoder="mlp"))
+    built = arguments(encoder="mlp", linear_path=True)
+    model = HVAE(Format.of("gridworld", "xy", (6, 2), True), built)
     model.load_state_dict(weights)
     model.eval()
     raw = torch.from_numpy(gridworld.action_observations([5], 64, "xy"))
@@ -350,6 +378,7 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
     (dict(recipe="slow"), "unknown recipe 'slow' for gridworld"),
     (dict(train_on="test"), "unknown train_on 'test'"),
     (dict(encoder="cnn"), "unknown encoder 'cnn'"),
+    (dict(env="stacking", linear_path=True), "linear_path: .* modality 'image'"),
     (dict(device="tpu"), "device 'tpu' is not available; allowed: auto, cpu"),
     (dict(split="odd"), "odd"),
     (dict(updates=0), "updates must be at least 1, got 0"),
