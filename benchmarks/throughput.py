@@ -514,9 +514,10 @@ def hvae() -> Iterator[Row]:
     torch.set_num_threads(1)
     first = None
     for what, changes in (
-        ("hvae: Bi-LSTM, paper width", dict(encoder="lstm", compact=False)),
-        ("hvae: Bi-LSTM, half width (recipe lstm)", dict(encoder="lstm")),
-        ("hvae: MLP encoder (recipes laptop, quick)", dict(encoder="mlp")),
+        ("hvae: Bi-LSTM, paper width", dict(recipe="lstm", compact=False)),
+        ("hvae: Bi-LSTM, half width (recipe lstm)", dict(recipe="lstm")),
+        ("hvae: MLP encoder (recipe mlp)", dict(recipe="mlp")),
+        ("hvae: MLP and linear path (recipes laptop, quick)", {}),
     ):
         args = encoder.resolve(encoder.Args(**changes))
         raw = grid.action_observations(np.arange(128), 4, "xy")
