@@ -38,6 +38,7 @@ def test_tables_equal_the_csv_files():
 
 
 def test_every_command_line_flag_it_names_is_known():
+    import hvae
     import ppo_actiongen
 
     sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -47,6 +48,10 @@ def test_every_command_line_flag_it_names_is_known():
     known |= {f.name.replace("_", "-") for f in ppo_actiongen.fields(ppo_actiongen.EvaluateArgs)}
     known |= {f.name.replace("_", "-") for f in ppo_actiongen.fields(paper.Args)}
     for line in re.findall(r"`(?:python ppo_actiongen\.py|--)[^`]*`", TEXT):
+        for flag in re.findall(r"--(?:no-)?([\w-]+)", line):
+            assert flag in known, flag
+    known = {f.name.replace("_", "-") for f in ppo_actiongen.fields(hvae.Args)}
+    for line in re.findall(r"`(?:python )?hvae\.py[^`]*`", TEXT):
         for flag in re.findall(r"--(?:no-)?([\w-]+)", line):
             assert flag in known, flag
 
