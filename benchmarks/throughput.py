@@ -159,6 +159,7 @@ def utility() -> Iterator[Row]:
         ("Recommender", 512, 500, 16, 10_000),
     ):
         args = ppo.default_args("gridworld", "fast", False)
+        args.hidden_size, args.utility_hidden = 64, 128
         space = gym.spaces.Box(-1, 1, (8,))
         table = np.random.default_rng(0).standard_normal((A, D)).astype(np.float32)
         parts = space, gym.spaces.Discrete(K), table, np.arange(A // 2)
