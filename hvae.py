@@ -248,6 +248,8 @@ def resolve(args: Args) -> Args:
     preset |= RECIPES[args.recipe]
     for special in (f"{args.recipe} {args.env}", f"{args.recipe} {modality}"):
         preset |= SPECIAL.get(special, {})
+    if preset.get("linear_path") and not args.hierarchical:  # no c, no path to it: learn longer
+        preset |= dict(linear_path=False, updates=RECIPES["mlp"]["updates"])
     if args.epochs and not args.updates:
         preset.pop("updates", None)  # asked for in epochs: the recipe's number steps back
     given = {key: value for key, value in asdict(args).items() if value is not None}
@@ -255,6 +257,8 @@ def resolve(args: Args) -> Args:
     for name in COUNTS:
         if (value := getattr(args, name)) is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+    if args.linear_path and not args.hierarchical:
+        raise ValueError("linear_path: the plain VAE has no c that a path could lead to")
     if args.linear_path and KINDS[modality] in ("image", "video"):
         raise ValueError(
             f"linear_path: a linear map of the pixels of modality {modality!r} says "
@@ -746,7 +750,6 @@ class VAE(ObservationModel):
 
     def __init__(self, fmt: Format, args: Args):
         size, hidden = args.representation_size, args.hidden
-        args = replace(args, linear_path=False)  # a path of q(c | X), which is not there
         super().__init__(fmt, args, latents=(size,))
         self.q_z = ObservationInference((hidden,), hidden, size)
         self.apply(initialise)
