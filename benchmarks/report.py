@@ -358,8 +358,9 @@ def comparison(experiment: str) -> str:
 def overview(experiment: str) -> str:
     """The main results: methods down, environments across, unseen actions only."""
     found, titles = shown(experiment), []
-    for env in found:
-        steps = Counter(millions(rows) for rows in scores(env).values())
+    ours = {env: scores(env, methods) for env, methods in found.items()}
+    for env, rows_of_env in ours.items():
+        steps = Counter(millions(rows) for rows in rows_of_env.values())
         titles.append(f"{paper.TITLES[env]}, {steps.most_common(1)[0][0]} steps")
     lines = ["| method | " + " | ".join(titles) + " |"]
     lines.append("|---" * (1 + len(found)) + "|")
@@ -367,8 +368,9 @@ def overview(experiment: str) -> str:
         cells = [METHODS[method]]
         for env, methods in found.items():
             known = published(env).get((method, "test"))
-            values = [float(r["score"]) for r in scores(env)[method, "test"]]
-            text = spread(values) if method in methods else "-"
+            text = "-"
+            if method in methods:
+                text = spread([float(r["score"]) for r in ours[env][method, "test"]])
             cells.append(text + (f" ({known[0]:.3f})" if known else ""))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n\nUnseen actions; in brackets: published (more steps, see below)."
