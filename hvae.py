@@ -200,8 +200,8 @@ ONE_HOT = dict(set_size=64, kl_warmup=0.0, linear_path=False)
 
 SPECIAL = {  # recipe and environment or modality -> what else is different there
     # With the linear path, a thousand updates say more about a held-out skill than six thousand
-    # without it. With 4,500 they say all there is, but skills that end in the same place, neighbours
-    # at first, drift apart (nn_net_match 0.77, then 0.41).
+    # without it. With 4,500 they say all there is, but skills that end in the same place drift
+    # apart again (nn_net_match 0.77, then 0.41).
     "laptop gridworld": SKILLS | dict(updates=1_000, linear_path=True),
     "quick gridworld": SKILLS | dict(updates=1_000, linear_path=True),
     "laptop create": CREATE | dict(updates=2_500),
