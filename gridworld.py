@@ -140,10 +140,11 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 
 def engineered_representations(variant: str = "12d") -> np.ndarray:
-    """Ground-truth features of all skills, float32 (1024, 12) or (1024, 5).
+    """Ground-truth features of all skills, float32 (1024, 12), (1024, 5) or (1024, 10).
 
     "12d": net (dx, dy) of the skill, then (dx, dy) of each of its five moves, in cells.
     "5d": the id of each move, mapped from 0..3 to [-1, 1] (right, down, left, up).
+    "path": where the skill has led after each of its five moves, (x, y) from its start, in cells.
     Raises ValueError for any other variant.
     """
     # appendix: 5-d, the five moves; published code: 12-d; we default to the latter because the
@@ -154,8 +155,12 @@ def engineered_representations(variant: str = "12d") -> np.ndarray:
         features = np.concatenate([deltas.sum(1), deltas.reshape(NUM_ACTIONS, -1)], axis=1)
     elif variant == "5d":
         features = SKILL_MOVES * 2 / 3 - 1
+    elif variant == "path":
+        # ours: a linear map of "12d", but in the terms in which lava and goals are laid out, so a
+        # utility that is smooth in it says the same of skills that pass the same cells.
+        features = MOVE_DELTAS[SKILL_MOVES].cumsum(1).reshape(NUM_ACTIONS, -1)  # (1024, 5 * 2)
     else:
-        raise ValueError(f"unknown variant {variant!r}; allowed: '12d', '5d'")
+        raise ValueError(f"unknown variant {variant!r}; allowed: '12d', '5d', 'path'")
     return features.astype(np.float32)
 
 

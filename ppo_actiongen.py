@@ -90,7 +90,7 @@ class Args:
     method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"
     """utility = the paper's policy; the other two are its baselines."""
     representation: str = "hvae"
-    """hvae | hvae-all (oracle encoder) | vae | engineered | engineered-5d | FILE.npz of hvae.py."""
+    """hvae | hvae-all (oracle encoder) | vae | engineered(-5d, -path) | FILE.npz of hvae.py."""
     modality: str | None = None
     """Modality of the action observations the encoder sees (default: the environment's first)."""
     split: str = "default"
@@ -832,7 +832,7 @@ def load_table(args: Args, train_ids: np.ndarray) -> np.ndarray:
         elif path.suffix != ".npz":
             raise ValueError(
                 f"representation {kind!r} is not one of hvae, hvae-all, vae, engineered, "
-                "engineered-5d, or the path of an .npz file"
+                "engineered-5d, engineered-path, or the path of an .npz file"
             )
         table = hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
     if args.standardize:

@@ -390,7 +390,10 @@ def test_engineered_representations():
     assert narrow.shape == (1024, 5) and narrow.dtype == np.float32
     np.testing.assert_allclose(narrow[skill_id("RDLUR")], [-1, -1 / 3, 1 / 3, 1, -1], atol=1e-6)
     assert len(np.unique(narrow, axis=0)) == len(np.unique(wide, axis=0)) == 1024
-    with pytest.raises(ValueError, match="'3d'.*'12d', '5d'"):
+    path = gridworld.engineered_representations("path")
+    assert path.shape == (1024, 10) and path.dtype == np.float32
+    assert path[skill_id("RDLUR")].tolist() == [1, 0, 1, 1, 0, 1, 0, 0, 1, 0]  # y grows downwards
+    with pytest.raises(ValueError, match="'3d'.*'12d', '5d', 'path'"):
         gridworld.engineered_representations("3d")
 
 
