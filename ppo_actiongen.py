@@ -187,6 +187,8 @@ class Args:
     """mlp = D.3.2; bilinear = code . M c, too plain to learn single actions by heart (ours)."""
     utility_hidden: int | None = None
     """Hidden width of the utility alone (default: hidden_size; wider is beyond the paper)."""
+    outcome_coef: float = 0.0
+    """Weight of outcome_loss: what the chosen action led to (ours, of the mlp utility; paper: 0)."""
 
     stop_bias: float = 0.0
     """Initial logit of going on, against stopping (ours; the paper: 0)."""
@@ -283,6 +285,7 @@ FAST = {
         hidden_size=128,  # with the next line: 0.565 -> 0.695 after 1M steps, each twice as dear
         utility_hidden=256,  # "left of the river after three moves" takes many ReLUs
         utility_gains=(1.0, math.sqrt(2), 0.01),  # 0.01 everywhere starves the gradient at first
+        outcome_coef=0.5,  # facts about actions; seed 0, 1M steps, engineered-path: 0.719 -> 0.803
         total_timesteps=10_000_000,
     ),
     "recsys": dict(
@@ -562,6 +565,8 @@ class Agent(nn.Module):
             self.action_project = layer_init(nn.Linear(D, H), project, generator)
             self.utility_hidden = layer_init(nn.Linear(2 * H, W), hidden, generator)
             self.utility_out = layer_init(nn.Linear(W, 1), out, generator)
+            if args.outcome_coef:  # two readings of the hidden layer, see outcome_loss
+                self.outcome = layer_init(nn.Linear(W, 2), 1.0, generator)
         elif self.method == "nearest-neighbor":  # one logit per *training* action
             self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01, generator)
         else:  # continuous output: a Gaussian in representation space
@@ -621,6 +626,12 @@ class Agent(nn.Module):
         else:
             logits = FactorisedUtility.hidden(u, P, available) @ w
         return logits + self.utility_out.bias
+
+    def predict_outcome(self, code, taken, P):
+        """The utility's hidden layer for one action each, read out: (B, H), (B,) -> (B, 2)."""
+        H = self.action_project.out_features
+        u = code @ self.utility_hidden.weight[:, :H].T  # (B, W)
+        return self.outcome(F.relu(u + P[taken]))  # (B, W) + (B, W) -> (B, 2)
 
     def gaussian(self, code):
         """Continuous output: mean and std (B, D) of the wished-for representation."""
@@ -985,6 +996,20 @@ class RewardScale:
         return (rewards / np.sqrt(self.stats.var + 1e-8)).clip(-10, 10)
 
 
+def outcome_loss(agent, code, mb, P):
+    """Ours: the utility's hidden layer has to tell what the chosen action led to, a scalar loss.
+
+    Predicted are mb["q"] (B,) = r + gamma V(s'), and mb["over"] (B,), whether the episode ended.
+    PPO's signal about an action is one advantage, weighted by how probable the action is anyway,
+    and fades once the policy has made up its mind. What an action leads to is the same fact however
+    the policy changes, and unseen actions are judged by the hidden units that learned it.
+    """
+    taken = mb["available"].gather(1, mb["choice"][:, None])[:, 0]  # (B, K) -> (B,) rows of P
+    q, over = agent.predict_outcome(code, taken, P).unbind(1)  # 2 x (B,)
+    error = 0.5 * (q - mb["q"]).square().mean()
+    return error + F.binary_cross_entropy_with_logits(over, mb["over"])
+
+
 def ppo_loss(agent, mb, P, ent_coef: float, args: Args):
     """The clipped loss of one minibatch; returns (loss, dict of its parts)."""
     code, value = agent.encode(mb["state"])
@@ -999,6 +1024,8 @@ def ppo_loss(agent, mb, P, ent_coef: float, args: Args):
     v_loss = 0.5 * v_error.mean()
     entropy = entropy.mean()
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
+    if hasattr(agent, "outcome"):
+        loss = loss + args.outcome_coef * outcome_loss(agent, code, mb, P)
     with torch.no_grad():
         clip_fraction = ((ratio - 1).abs() > args.clip_coef).float().mean()
     parts = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy, clip_fraction=clip_fraction)
@@ -1325,8 +1352,8 @@ def check(args: Args) -> None:
             raise ValueError(f"{name} {value} is not a finite number")
     if args.conv_gain is not None and args.conv_gain <= 0:
         raise ValueError(f"conv_gain {args.conv_gain} is not above 0 (or None)")
-    if args.ent_coef < 0 or args.learning_rate <= 0:
-        raise ValueError("ent_coef must be at least 0 and learning_rate above 0")
+    if min(args.ent_coef, args.outcome_coef) < 0 or args.learning_rate <= 0:
+        raise ValueError("ent_coef, outcome_coef must be at least 0 and learning_rate above 0")
     if args.task is not None and "task" not in TASK_OPTIONS.get(args.env, ()):
         raise ValueError(f"task {args.task!r}: {args.env} has no tasks")
     for name in ("fully_observable", "placement"):
@@ -1572,6 +1599,11 @@ def train(args: Args) -> dict:
         advantages = gae(rewards, values, dones, next_value, args.gamma, args.gae_lambda)
         batch["advantage"] = torch.as_tensor(advantages, dtype=torch.float32)
         batch["return"] = torch.as_tensor(advantages + values, dtype=torch.float32)
+        if hasattr(run.agent, "outcome"):
+            after = np.concatenate([values[1:], next_value[None]])  # V(s'), (T, N)
+            q = rewards + args.gamma * (1.0 - dones) * after
+            batch["q"] = torch.as_tensor(q, dtype=torch.float32)
+            batch["over"] = torch.as_tensor(dones, dtype=torch.float32)
 
         # Learn, then let the normaliser catch up with what was seen.
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)

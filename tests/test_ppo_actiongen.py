@@ -259,15 +259,17 @@ def test_reward_scale_divides_by_the_std_of_the_discounted_return():
     assert np.allclose(scaled, rewards / np.std(returns), rtol=1e-3)
 
 
-def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss():
-    agent, args = make_agent(update_epochs=1, num_minibatches=1, max_grad_norm=1e9)
+@pytest.mark.parametrize("outcome_coef", [0.0, 0.5])
+def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss(outcome_coef):
+    agent, args = make_agent(update_epochs=1, num_minibatches=1, outcome_coef=outcome_coef)
     B = 32
     sets, state = random_sets(B), torch.randn(B, 7)
     action, logprob, value = agent.act(
         state, sets, agent.project_actions(), torch.Generator().manual_seed(0)
     )
-    adv, returns = torch.randn(B), torch.randn(B)
+    adv, returns, q = torch.randn(3, B)
     mb = dict(state=state, available=sets, logprob=logprob, value=value, advantage=adv)
+    mb |= dict(q=q, over=(torch.arange(B) % 3 == 0).float())
     loss, parts = ppo.ppo_loss(
         agent, mb | action | {"return": returns}, agent.project_actions(), 0.05, args
     )
@@ -278,6 +280,13 @@ def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss():
     v_clip = value + (v - value).clamp(-0.1, 0.1)
     v_loss = torch.max((v - returns) ** 2, (v_clip - returns) ** 2).mean() * 0.5
     expected = -surrogate + 0.5 * v_loss - 0.05 * dist.entropy().mean()
+    if outcome_coef:  # the hidden layer of the concatenation, for the chosen action alone
+        c = agent.action_project(agent.table[sets[range(B), action["choice"]]])  # (B, H)
+        hidden = F.relu(agent.utility_hidden(torch.cat([code, c], dim=1)))  # (B, W)
+        guess = agent.outcome(hidden)  # (B, 2)
+        end = torch.sigmoid(guess[:, 1])
+        unlikely = torch.where(mb["over"] == 1, -end.log(), -(1 - end).log())
+        expected = expected + 0.5 * (0.5 * (guess[:, 0] - q) ** 2 + unlikely).mean()
     torch.testing.assert_close(loss, expected)
     assert parts["clip_fraction"] == 0  # nothing has changed yet
 
@@ -299,6 +308,8 @@ def image_batch(agent, T, N):
     flat = dict(state=state, available=sets, logprob=logprob, value=value) | action
     flat["advantage"] = torch.randn(T * N, generator=rng)
     flat["return"] = torch.randn(T * N, generator=rng)
+    flat["q"] = torch.randn(T * N, generator=rng)
+    flat["over"] = (flat["q"] > 1).float()
     return {k: v.detach().unflatten(0, (T, N)) for k, v in flat.items()}
 
 
@@ -368,6 +379,7 @@ def gradient_of_update(agent, args, batch):
 @pytest.mark.parametrize("method", ["utility", "continuous", "nearest-neighbor"])
 def test_micro_batches_add_up_to_the_gradient_of_the_minibatch(method):
     once = dict(update_epochs=1, num_minibatches=1, max_grad_norm=1e9, method=method)
+    once |= dict(outcome_coef=0.5)  # of no effect on the baselines
     agent, args = make_agent(HYBRID, FRAMES, bf16=False, **once)
     start, batch = {k: v.clone() for k, v in agent.state_dict().items()}, image_batch(agent, 8, 6)
     # The plain form: the whole minibatch at once, the table projected inside it, plain layers.
@@ -640,6 +652,7 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--num-available", "0"], "num_available 0"),
         (["--num-available", "600"], "600 is more than the 512"),
         (["--conv-gain", "-1"], "conv_gain -1.0 is not above 0"),
+        (["--outcome-coef", "-1"], "outcome_coef must be at least 0"),
         (["--vf-coef", "nan"], "vf_coef nan is not a finite number"),
         (["--total-timesteps", "-5"], "total_timesteps -5"),
         (["--total-timesteps", "10"], "less than one rollout of 256"),
