@@ -187,8 +187,10 @@ class Args:
     """mlp = D.3.2; bilinear = code . M c, too plain to learn single actions by heart (ours)."""
     utility_hidden: int | None = None
     """Hidden width of the utility alone (default: hidden_size; wider is beyond the paper)."""
+    explore: float = 0.0
+    """While learning, this share of choices is uniform over those on offer (ours; paper: 0)."""
     outcome_coef: float = 0.0
-    """Weight of outcome_loss: what the chosen action led to (ours, of the mlp utility; paper: 0)."""
+    """Weight of outcome_loss: what the chosen action led to (ours, utility mlp; paper: 0)."""
 
     stop_bias: float = 0.0
     """Initial logit of going on, against stopping (ours; the paper: 0)."""
@@ -285,6 +287,7 @@ FAST = {
         hidden_size=128,  # with the next line: 0.565 -> 0.695 after 1M steps, each twice as dear
         utility_hidden=256,  # "left of the river after three moves" takes many ReLUs
         utility_gains=(1.0, math.sqrt(2), 0.01),  # 0.01 everywhere starves the gradient at first
+        explore=0.1,  # what nobody tries any more is forgotten, and unseen skills with it
         outcome_coef=0.5,  # facts about actions; seed 0, 1M steps, engineered-path: 0.719 -> 0.803
         total_timesteps=10_000_000,
     ),
@@ -575,6 +578,7 @@ class Agent(nn.Module):
         heads = action_space.spaces if isinstance(action_space, gym.spaces.Dict) else {}
         self.has_position, self.has_stop = "position" in heads, "stop" in heads
         self.aux_conditioned = args.aux_conditioned
+        self.explore = args.explore if self.method == "utility" else 0.0
         if self.has_position:
             d = heads["position"].shape[-1]
             self.fc_alpha, self.fc_beta = (self.position_head(H, d, args, generator) for _ in "ab")
@@ -633,6 +637,19 @@ class Agent(nn.Module):
         u = code @ self.utility_hidden.weight[:, :H].T  # (B, W)
         return self.outcome(F.relu(u + P[taken]))  # (B, W) + (B, W) -> (B, 2)
 
+    def mixture(self, logp):
+        """log of (1 - explore) pi + explore / K, the policy while learning: (B, K) -> (B, K).
+
+        Ours. A policy that improves stops trying what it takes to be bad, and then forgets why it
+        is bad: what it thinks of these actions is free to drift, and with it what it thinks of
+        unseen ones, which no experience corrects. PPO learns the mixture, so it stays on-policy;
+        evaluation plays pi alone. Actions that only `explore` would choose get hardly any policy
+        gradient; what they teach is their outcome (outcome_loss).
+        """
+        if not self.explore:
+            return logp
+        return torch.log((1 - self.explore) * logp.exp() + self.explore / logp.shape[1])
+
     def gaussian(self, code):
         """Continuous output: mean and std (B, D) of the wished-for representation."""
         return self.head_mean(code), F.softplus(self.head_var(code)).sqrt()
@@ -681,7 +698,7 @@ class Agent(nn.Module):
         return out, logprob, entropy
 
     @torch.no_grad()
-    def act(self, state, available, P, generator, greedy=False):
+    def act(self, state, available, P, generator, greedy=False, learning=False):
         """Choose actions: (B, ...), (B, K) -> (action dict, log-probability (B,), value (B,)).
 
         action["choice"] is a slot of `available`, what the environment executes. The baselines
@@ -698,6 +715,7 @@ class Agent(nn.Module):
             action["choice"] = self.nearest(action["wish"], available)
         else:
             logp = F.log_softmax(self.choice_logits(code, available, P), dim=1)
+            logp = self.mixture(logp) if learning else logp
             choice = logp.argmax(1) if greedy else sample(logp, generator)
             logprob = logp.gather(1, choice[:, None])[:, 0]
             if self.method == "nearest-neighbor":
@@ -720,7 +738,7 @@ class Agent(nn.Module):
         else:
             logp = F.log_softmax(self.choice_logits(code, available, P), dim=1)  # (B, K)
             taken = action["choice" if self.method == "utility" else "head"]
-            logprob = logp.gather(1, taken[:, None])[:, 0]
+            logprob = self.mixture(logp).gather(1, taken[:, None])[:, 0]
             entropy = -(logp.exp() * logp).sum(1)
         _, aux_logprob, aux_entropy = self.auxiliary(
             code, action=action, taken=action["taken"] if self.aux_conditioned else None
@@ -944,7 +962,9 @@ def rollout(envs, obs, agent, preprocess, num_steps, generator, device, metric):
     steps, episodes = [], []
     for _ in range(num_steps):
         state, available = preprocess(obs["state"]), torch.as_tensor(obs["available"])
-        action, logprob, value = agent.act(state.to(device), available.to(device), P, generator)
+        action, logprob, value = agent.act(
+            state.to(device), available.to(device), P, generator, learning=True
+        )
         step = dict(state=state, available=available, logprob=logprob, value=value) | action
         if preprocess.normalizes:
             step["raw"] = obs["state"]  # for its running statistics
@@ -1352,6 +1372,8 @@ def check(args: Args) -> None:
             raise ValueError(f"{name} {value} is not a finite number")
     if args.conv_gain is not None and args.conv_gain <= 0:
         raise ValueError(f"conv_gain {args.conv_gain} is not above 0 (or None)")
+    if not 0 <= args.explore < 1:
+        raise ValueError(f"explore {args.explore} is not at least 0 and below 1")
     if min(args.ent_coef, args.outcome_coef) < 0 or args.learning_rate <= 0:
         raise ValueError("ent_coef, outcome_coef must be at least 0 and learning_rate above 0")
     if args.task is not None and "task" not in TASK_OPTIONS.get(args.env, ()):

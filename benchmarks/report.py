@@ -41,7 +41,10 @@ METHODS = {
     "nearest_neighbor": "Nearest neighbour",
     "continuous_output": "Continuous output",
     "ours_mlp_encoder": "Ours, MLP encoder",
-    "ours_wide": "Ours, linear path, wide",
+    "ours_wide": "Ours, fast recipe, paper's loss",
+    "ours_outcome": "Ours, fast recipe w/o exploring",
+    "ours_fast": "Ours, fast recipe",
+    "engineered_fast": "Engineered, fast recipe",
     "ours_bilinear": "Ours, bilinear utility",
     "ours_video": "Ours, video",
     "ours_no_subgoal_reward": "No subgoal reward",
@@ -75,6 +78,14 @@ BAR_KEY = "filled: this repository (dots: seeds)   outlined: published   line: c
 RECIPE = {
     "gridworld-recipe": {
         "fast": ("none: the fast recipe", ""),
+        "no_exploring": (
+            "no random choices while learning",
+            "one in ten: what nobody tries any more is forgotten, and unseen skills with it",
+        ),
+        "no_outcome": (
+            "and the paper's loss alone",
+            "the utility's hidden layer also learns what the chosen action led to",
+        ),
         "narrow": (
             "networks half as wide: 64, utility 128",
             '128, utility 256: "left of the river after three moves" takes many ReLUs',

@@ -148,18 +148,37 @@ def test_one_hot_layer_equals_the_product_with_a_one_hot_vector():
 # ---- distributions ----
 
 
+@pytest.mark.parametrize("explore", [0.0, 0.3])
 @pytest.mark.parametrize("method", ["utility", "nearest-neighbor", "continuous"])
-def test_log_probability_when_acting_equals_that_when_learning(method):
-    agent, _ = make_agent(HYBRID, method=method)
+def test_log_probability_when_acting_equals_that_when_learning(method, explore):
+    agent, _ = make_agent(HYBRID, method=method, explore=explore)
     state, sets = torch.randn(11, 7), random_sets(11)
     P = agent.project_actions()
-    action, logprob, value = agent.act(state, sets, P, torch.Generator().manual_seed(0))
+    noise = torch.Generator().manual_seed(0)
+    action, logprob, value = agent.act(state, sets, P, noise, learning=True)
     code, value2 = agent.encode(state)
     logprob2, entropy = agent.logprob_entropy(code, sets, action, P)
     torch.testing.assert_close(logprob, logprob2)
     torch.testing.assert_close(value, value2)
     assert set(action) >= {"choice", "position", "stop"} and entropy.shape == (11,)
     assert action["position"].abs().max() <= 1 and action["choice"].max() < 5
+
+
+def test_exploring_mixes_in_uniform_choices_while_learning_only():
+    agent, _ = make_agent(explore=0.25, utility_gains=(3.0, 3.0, 3.0))
+    B = 4000
+    state, sets = torch.randn(1, 7).expand(B, -1), random_sets(1).expand(B, -1)
+    P, noise = agent.project_actions(), torch.Generator().manual_seed(0)
+    pi = naive_logits(agent, agent.encode(state[:1])[0], sets[:1]).softmax(1)[0].detach()  # (5,)
+    assert pi.max() > 0.5  # else there is nothing to see
+    for learning, expected in ((False, pi), (True, 0.75 * pi + 0.05)):
+        action, logprob, _ = agent.act(state, sets, P, noise, learning=learning)
+        torch.testing.assert_close(logprob.exp(), expected[action["choice"]])
+        share = torch.bincount(action["choice"], minlength=5) / B
+        assert (share - expected).abs().max() < 4 * math.sqrt(0.25 / B)
+    assert torch.equal(
+        agent.act(state, sets, P, noise, greedy=True)[0]["choice"], pi.argmax().expand(B)
+    )
 
 
 def test_hybrid_log_probability_and_entropy_are_sums_of_their_parts():
@@ -652,6 +671,7 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--num-available", "0"], "num_available 0"),
         (["--num-available", "600"], "600 is more than the 512"),
         (["--conv-gain", "-1"], "conv_gain -1.0 is not above 0"),
+        (["--explore", "1"], "explore 1.0 is not at least 0 and below 1"),
         (["--outcome-coef", "-1"], "outcome_coef must be at least 0"),
         (["--vf-coef", "nan"], "vf_coef nan is not a finite number"),
         (["--total-timesteps", "-5"], "total_timesteps -5"),
