@@ -327,7 +327,7 @@ FAST = {
 
 # --quick: the fast recipe with a smaller budget, never another algorithm.
 QUICK = {
-    "gridworld": dict(total_timesteps=3_000_000, hvae_recipe="quick"),
+    "gridworld": dict(total_timesteps=2_000_000, hvae_recipe="quick"),
     "recsys": dict(total_timesteps=1_000_000),
     "create": dict(total_timesteps=400_000, hvae_recipe="quick", eval_episodes=500),
     "stacking": dict(total_timesteps=60_000, hvae_recipe="quick", eval_episodes=500),

@@ -87,7 +87,7 @@ RECIPE = {
             "the utility's hidden layer also learns what the chosen action led to",
         ),
         "narrow": (
-            "networks half as wide: 64, utility 128",
+            "and networks half as wide: 64, utility 128",
             '128, utility 256: "left of the river after three moves" takes many ReLUs',
         ),
         "utility_width_64": ("the same, utility 64", ""),
@@ -130,7 +130,8 @@ RECIPE = {
     },
 }
 RECIPE_NOTE = {
-    "gridworld-recipe": "Engineered representation; below the first row, networks half as wide",
+    "gridworld-recipe": "Engineered representation; each row down to the narrow networks keeps "
+    "what those above it have undone, and each one below them keeps all of that",
     "create-recipe": "Learned representation",
 }
 
