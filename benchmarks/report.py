@@ -41,10 +41,10 @@ METHODS = {
     "nearest_neighbor": "Nearest neighbour",
     "continuous_output": "Continuous output",
     "ours_mlp_encoder": "Ours, MLP encoder",
-    "ours_wide": "Ours, fast recipe, paper's loss",
-    "ours_outcome": "Ours, fast recipe w/o exploring",
-    "ours_fast": "Ours, fast recipe",
-    "engineered_fast": "Engineered, fast recipe",
+    "ours_wide": "Fast recipe, paper's loss",
+    "ours_outcome": "Fast recipe w/o exploring",
+    "ours_fast": "Fast recipe",
+    "engineered_fast": "Fast recipe, engineered",
     "ours_bilinear": "Ours, bilinear utility",
     "ours_video": "Ours, video",
     "ours_no_subgoal_reward": "No subgoal reward",
@@ -250,7 +250,7 @@ def table(env: str) -> str:
         cells += [str(len(rows)), millions(rows), f"{hours:.2f}"]
         lines.append("| " + " | ".join(cells) + " |")
     # Stacking's environments are processes of their own: physics takes every core there is.
-    cores = "two CPU cores" if env == "stacking" else "one CPU core"
+    cores = "two CPU cores, other runs beside them" if env == "stacking" else "one CPU core"
     note = f"Ceiling: {ceiling[1]}{phases.format(*ceiling)}. " if ceiling else ""
     lines.append(
         f"\n{note}± is the standard deviation over seeds; hours are per seed on {cores}. "
