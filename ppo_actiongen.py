@@ -287,8 +287,8 @@ FAST = {
         hidden_size=128,  # with the next line: 0.565 -> 0.695 after 1M steps, each twice as dear
         utility_hidden=256,  # "left of the river after three moves" takes many ReLUs
         utility_gains=(1.0, math.sqrt(2), 0.01),  # 0.01 everywhere starves the gradient at first
-        explore=0.1,  # what nobody tries any more is forgotten, and unseen skills with it
-        outcome_coef=0.5,  # facts about actions; seed 0, 1M steps, engineered-path: 0.719 -> 0.803
+        explore=0.1,  # what nobody tries any more is forgotten; split 0, 4M steps: 0.895 -> 0.918
+        outcome_coef=0.5,  # facts about skills, not opinions: 0.695 -> 0.819 after 1M steps
         total_timesteps=10_000_000,
     ),
     "recsys": dict(

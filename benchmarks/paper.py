@@ -314,7 +314,7 @@ RATES = {  # environment steps per second of one run on one core: benchmarks/thr
     "create": 900,
     "stacking": 100,
 }
-WIDE_RATE = 6_000  # Grid World with the fast recipe's networks, as measured by its runs
+WIDE_RATE = 4_000  # Grid World with the fast recipe's networks, as measured by its runs
 EPISODE = {"gridworld": 10, "recsys": 100, "create": 30, "stacking": 10}  # steps at most, Table 3
 TEST_ACTIONS = {"gridworld": 256, "recsys": 2500, "create": 507, "stacking": 203}  # 2:1:1, A
 # Recipe laptop, one core; last `seconds` of the CSV beside each table: 230 s Grid World (x, y) with

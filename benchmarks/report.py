@@ -80,7 +80,7 @@ RECIPE = {
         "fast": ("none: the fast recipe", ""),
         "no_exploring": (
             "no random choices while learning",
-            "one in ten: what nobody tries any more is forgotten, and unseen skills with it",
+            "one in ten: what nobody tries any more is forgotten (pays later: 4M steps above)",
         ),
         "no_outcome": (
             "and the paper's loss alone",
