@@ -640,9 +640,9 @@ class Agent(nn.Module):
     def mixture(self, logp):
         """log of (1 - explore) pi + explore / K, the policy while learning: (B, K) -> (B, K).
 
-        Ours; our reading: a policy that improves stops trying what it takes to be bad, then forgets
-        why it is bad: what it thinks of these actions is free to drift, and with it what it thinks of
-        unseen ones, which no experience corrects. PPO learns the mixture, so it stays on-policy;
+        Ours. Our reading: a policy that improves stops trying what it takes to be bad, then forgets
+        why; what it thinks of these actions is free to drift, and with it what it thinks of unseen
+        ones, which no experience corrects. PPO learns the mixture, so it stays on-policy;
         evaluation plays pi alone. Actions that only `explore` would choose get hardly any policy
         gradient; what they teach is their outcome (outcome_loss).
         """
