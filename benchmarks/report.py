@@ -43,7 +43,6 @@ METHODS = {
     "ours_mlp_encoder": "Ours, MLP encoder",
     "ours_wide": "Fast recipe, paper's loss",
     "ours_outcome": "Fast recipe w/o exploring",
-    "ours_explore": "Fast recipe, some entropy kept",
     "ours_fast": "Fast recipe",
     "engineered_fast": "Fast recipe, engineered",
     "ours_bilinear": "Ours, bilinear utility",
@@ -79,12 +78,8 @@ BAR_KEY = "filled: this repository (dots: seeds)   outlined: published   line: c
 RECIPE = {
     "gridworld-recipe": {
         "fast": ("none: the fast recipe", ""),
-        "entropy_to_a_tenth": (
-            "the entropy bonus decays to a tenth",
-            "to zero: one stray sample ends an episode in lava",
-        ),
         "no_exploring": (
-            "and no random choices while learning",
+            "no random choices while learning",
             "one in ten: what nobody tries any more is forgotten (pays later: 4M steps above)",
         ),
         "no_outcome": (
@@ -115,7 +110,7 @@ RECIPE = {
         "not_standardized": ("representations as they come", "mean 0, std 1 over training actions"),
         "entropy_constant": (
             "constant entropy coefficient",
-            "decays to a tenth",
+            "decays to a tenth: one stray sample ends an episode in lava",
         ),
     },
     "create-recipe": {

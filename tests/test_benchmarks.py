@@ -64,7 +64,6 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_mlp_encoder",
             "ours_wide",
             "ours_outcome",
-            "ours_explore",
             "ours_fast",
             "engineered_fast",
             "ours_analysis",
