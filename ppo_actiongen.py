@@ -1000,6 +1000,13 @@ def gae(rewards, values, dones, next_value, gamma, lam):
     return advantages
 
 
+def explained_variance(values, returns) -> float:
+    """1 - Var[return - V] / Var[return] over the rollout: 1 a perfect critic, 0 a useless one."""
+    values, returns = (np.concatenate(gathered(x.ravel())) for x in (values, returns))  # (T*N,)
+    spread = returns.var()
+    return float(1 - (returns - values).var() / spread) if spread else math.nan
+
+
 class RewardScale:
     """Divide rewards by the running std of the discounted return G <- gamma G + r (no mean)."""
 
@@ -1034,7 +1041,8 @@ def ppo_loss(agent, mb, P, ent_coef: float, args: Args):
     """The clipped loss of one minibatch; returns (loss, dict of its parts)."""
     code, value = agent.encode(mb["state"])
     logprob, entropy = agent.logprob_entropy(code, mb["available"], mb, P)
-    ratio = (logprob - mb["logprob"]).exp()
+    logratio = logprob - mb["logprob"]
+    ratio = logratio.exp()
     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     pg_loss = -torch.min(ratio * mb["advantage"], clipped * mb["advantage"]).mean()
     v_error = (value - mb["return"]).square()
@@ -1048,7 +1056,9 @@ def ppo_loss(agent, mb, P, ent_coef: float, args: Args):
         loss = loss + args.outcome_coef * outcome_loss(agent, code, mb, P)
     with torch.no_grad():
         clip_fraction = ((ratio - 1).abs() > args.clip_coef).float().mean()
-    parts = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy, clip_fraction=clip_fraction)
+        approx_kl = (ratio - 1 - logratio).mean()  # E[r - 1 - log r], r under the old policy
+    parts = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy)
+    parts |= dict(clip_fraction=clip_fraction, approx_kl=approx_kl)
     return loss, {k: v.detach() for k, v in parts.items()}
 
 
@@ -1148,7 +1158,7 @@ def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=
 
 COLUMNS = (
     "step seconds sps train_score valid_score episode_score episode_return episode_length "
-    "pg_loss v_loss entropy clip_fraction learning_rate"
+    "pg_loss v_loss entropy clip_fraction approx_kl explained_variance learning_rate"
 ).split()
 
 
@@ -1647,6 +1657,7 @@ def train(args: Args) -> dict:
             "episode_score": float(scores.mean()),
             "episode_return": float(returns.mean()),
             "episode_length": float(lengths.mean()),
+            "explained_variance": explained_variance(values, advantages + values),
             "learning_rate": lr,
         }
         at_end = run.update_index == run.num_updates

@@ -307,7 +307,15 @@ def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss(outcome_coef
         unlikely = torch.where(mb["over"] == 1, -end.log(), -(1 - end).log())
         expected = expected + 0.5 * (0.5 * (guess[:, 0] - q) ** 2 + unlikely).mean()
     torch.testing.assert_close(loss, expected)
-    assert parts["clip_fraction"] == 0  # nothing has changed yet
+    assert parts["clip_fraction"] == parts["approx_kl"] == 0  # nothing has changed yet
+
+
+def test_explained_variance_of_perfect_useless_and_harmful_critics():
+    returns = np.random.default_rng(0).normal(size=(8, 4))
+    assert ppo.explained_variance(returns + 3, returns) == pytest.approx(1)  # a shift is no matter
+    assert ppo.explained_variance(np.full((8, 4), 7.0), returns) == pytest.approx(0)
+    assert ppo.explained_variance(-returns, returns) == pytest.approx(-3)
+    assert math.isnan(ppo.explained_variance(returns, np.ones((8, 4))))
 
 
 # ---- image states ----
