@@ -45,6 +45,7 @@ METHODS = {
     "ours_outcome": "Fast recipe w/o exploring",
     "ours_fast": "Fast recipe",
     "engineered_fast": "Fast recipe, engineered",
+    "ours_predicts": "Ours, predicting outcomes",
     "ours_bilinear": "Ours, bilinear utility",
     "ours_video": "Ours, video",
     "ours_no_subgoal_reward": "No subgoal reward",

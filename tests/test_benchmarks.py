@@ -64,6 +64,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_mlp_encoder",
             "ours_wide",
             "ours_outcome",
+            "ours_predicts",
             "ours_fast",
             "engineered_fast",
             "ours_analysis",
