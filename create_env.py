@@ -1015,11 +1015,14 @@ def check_pool(action_pool: Sequence[int] | None, num_available: int) -> np.ndar
     tools = np.unique(pool).astype(np.int64)
     if len(tools) != len(pool):
         raise ValueError(f"action_pool has {len(pool) - len(tools)} repeated ids")
-    if num_available < 1 or num_available > len(pool):
+    tools = tools[tools != NO_OP]
+    most, whole = len(tools) + 1, isinstance(num_available, int | np.integer)
+    if not whole or not 1 <= num_available <= most:
         raise ValueError(
-            f"num_available must be 1..{len(pool)} (the pool's size), got {num_available}"
+            f"num_available must be an integer in 1..{most} (the pool's tools and the no-op), "
+            f"got {num_available!r}"
         )
-    return tools[tools != NO_OP]
+    return tools
 
 
 class CreateEnv(gymnasium.Env):
@@ -1105,6 +1108,7 @@ class CreateEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start an episode with a new set of tools; returns (observation, {})."""
         super().reset(seed=seed)
+        # published code: the Full split's test draws a class, then a tool of it; we: as in training
         tools, k = self._tools_on_offer, self.action_space["choice"].n
         drawn = self.np_random.choice(tools, k - 1, replace=False) if self._draws else tools
         self._available = np.concatenate([[NO_OP], drawn])  # (K,)
@@ -1319,6 +1323,8 @@ class CreateEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """The scene now, in colour, uint8 (height, render_size, 3); None without render_mode."""
+        if self.render_mode and not hasattr(self, "_things"):
+            raise gymnasium.error.ResetNeeded("call reset() before the first render()")
         return self.render_frames()[-1] if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
@@ -2064,7 +2070,7 @@ def main(args: Args) -> None:
         frames, total, length = play_episode(env, best)
         path = args.out / f"create_{args.task}.gif"
         save_gif(path, frames, env.metadata["render_fps"])
-    except (ValueError, FileNotFoundError) as e:
+    except (ValueError, OSError) as e:
         raise SystemExit(f"error: {e}") from e
     print(
         f"best of {args.tries} random episodes of {args.task}: seed {best}, {length} actions, ",

@@ -241,9 +241,20 @@ def _check_pool(action_pool: np.ndarray | None, num_available: int) -> np.ndarra
     pool = np.sort(_check_ids(split_actions()["train"] if action_pool is None else action_pool))
     if (repeated := pool[1:][pool[1:] == pool[:-1]]).size:
         raise ValueError(f"action id {repeated[0]} is in the pool twice; allowed: once")
-    if not 1 <= num_available <= len(pool):
-        raise ValueError(f"num_available is {num_available}; allowed: 1..{len(pool)} (the pool)")
+    if not isinstance(num_available, int | np.integer) or not 1 <= num_available <= len(pool):
+        raise ValueError(
+            f"num_available is {num_available!r}; allowed: integers 1..{len(pool)} (the pool)"
+        )
     return pool
+
+
+def _check_layout(options: dict | None) -> int | None:
+    """The layout that `reset(options={"layout": 7})` asks for; ValueError if there is none."""
+    layout = (options or {}).get("layout")
+    whole = isinstance(layout, int | np.integer) and not isinstance(layout, bool)
+    if layout is not None and not (whole and 0 <= layout < len(LAYOUTS)):
+        raise ValueError(f"layout is {layout!r}; allowed: integers 0..{len(LAYOUTS) - 1}")
+    return layout
 
 
 def _observation_space(num_available: int) -> gym.spaces.Dict:
@@ -312,9 +323,7 @@ class GridWorldEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Draw a layout and the skills on offer; returns (observation, {})."""
-        layout = (options or {}).get("layout")
-        if layout is not None and layout not in range(len(LAYOUTS)):
-            raise ValueError(f"layout is {layout!r}; allowed: 0..{len(LAYOUTS) - 1}")
+        layout = _check_layout(options)
         super().reset(seed=seed)
         self._layout, self._available = self._draw_episode()
         if layout is not None:
@@ -345,6 +354,8 @@ class GridWorldEnv(gym.Env):
         """Carry out one skill; returns (observation, reward, terminated, truncated, info)."""
         if self._over:
             raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
+        if np.ndim(action) or np.asarray(action).dtype.kind not in "iu":
+            raise ValueError(f"action is {action!r}; allowed: one integer")
         if not 0 <= action < self.num_available:
             raise ValueError(f"action is {action}; allowed: 0..{self.num_available - 1}")
         self._skill = int(self._available[action])
@@ -386,6 +397,8 @@ class GridWorldEnv(gym.Env):
         if self.render_mode is None:
             gym.logger.warn("render() needs render_mode='rgb_array'; nothing is drawn")
             return None
+        if not hasattr(self, "_layout"):
+            raise gym.error.ResetNeeded("call reset() before the first render()")
         return draw_frame(self._layout, self.trace, self._skill, self._moves)
 
     def render_frames(self) -> list[np.ndarray]:
@@ -464,9 +477,12 @@ class GridWorldVectorEnv(VectorEnv):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start all episodes anew; returns (observations, {}). A seed reseeds the one generator."""
+        layout = _check_layout(options)
         super().reset(seed=seed)
         self._bank = np.empty((0, self.num_available), np.int64)
         self._start(self._rows)
+        if layout is not None:
+            self._layout[:] = layout
         return self._observation(), {}
 
     def _start(self, envs: np.ndarray) -> None:
@@ -509,8 +525,11 @@ class GridWorldVectorEnv(VectorEnv):
         if self._bank is None:
             raise gym.error.ResetNeeded("call reset() before the first step()")
         actions, k = np.asarray(actions), self.num_available
-        if actions.shape != self._rows.shape or actions.min() < 0 or actions.max() >= k:
-            raise ValueError(f"actions are {actions}; allowed: {self.num_envs} of 0..{k - 1}")
+        whole = actions.shape == self._rows.shape and actions.dtype.kind in "iu"
+        if not whole or actions.min() < 0 or actions.max() >= k:
+            raise ValueError(
+                f"actions are {actions}; allowed: {self.num_envs} integers in 0..{k - 1}"
+            )
         skills = self._available[self._rows, actions]  # (N,) ids
         self._cell[:], moves, subgoal, goal, lava = self._effects[
             self._layout, self._cell, skills

@@ -39,7 +39,7 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Literal
@@ -119,6 +119,9 @@ class Args:
     threads: int = 1  # CPU threads of torch; a second one waits more than it works
     plots: bool = True  # draw the t-SNE and reconstruction pictures
 
+
+# The options that a recipe decides unless they are given.
+OVERRIDES = [f.name for f in fields(Args) if f.default is None and f.name != "modality"]
 
 TABLE_3 = {
     "gridworld": dict(representation_size=16, batch_size=128, epochs=10_000),
@@ -259,6 +262,8 @@ def resolve(args: Args) -> Args:
             raise ValueError(f"{name} must be at least 1, got {value}")
     if args.linear_path and not args.hierarchical:
         raise ValueError("linear_path: the plain VAE has no c that a path could lead to")
+    if args.compact and args.encoder == "lstm" and args.hidden % 2:
+        raise ValueError(f"hidden {args.hidden}: the Bi-LSTM has two halves, so it must be even")
     if args.linear_path and KINDS[modality] in ("image", "video"):
         raise ValueError(
             f"linear_path: a linear map of the pixels of modality {modality!r} says "
@@ -745,7 +750,8 @@ class VAE(ObservationModel):
     """The non-hierarchical baseline (appendix B): each observation for itself, averaged at the end.
 
     published code: a quarter of the HVAE's updates and another initialisation; we give both models
-    the same batches, updates and initialisation, so that only the hierarchy differs.
+    the same batches, updates and initialisation, so that only the hierarchy differs. (Where the
+    HVAE's recipe has a linear path, which the VAE cannot have, that gets more updates: `resolve`.)
     """
 
     def __init__(self, fmt: Format, args: Args):
@@ -942,14 +948,16 @@ def representation_path(args: Args) -> Path:
     """Where `train(args)` writes its table:
 
     <runs_dir>/hvae/<env>-<modality>-<hvae|vae>[-all]-<split>-<recipe>-s<seed>.npz; a split seed
-    other than 0 follows the split, an encoder other than the recipe's follows the recipe.
+    other than 0 follows the split, and what differs from the recipe follows the recipe, as in
+    laptop-updates=9: a policy that asks for a recipe's table never finds an experiment's.
     """
-    full, recipe = resolve(args), args.recipe
-    if full.encoder != resolve(replace(args, encoder=None)).encoder:
-        recipe += f"_{full.encoder}"
+    full = resolve(args)
+    choices = {k: v for k, v in settings(args).items() if v is not None and k in OVERRIDES}
+    recipe = settings(resolve(replace(args, **dict.fromkeys(OVERRIDES))))
+    changed = [f"{k}={v}" for k, v in choices.items() if getattr(full, k) != recipe[k]]
     parts = [args.env, full.modality, "hvae" if args.hierarchical else "vae"]
     parts += ["all"] * (args.train_on == "all")
-    parts += [f"{args.split}{args.split_seed or ''}", recipe, f"s{args.seed}"]
+    parts += [f"{args.split}{args.split_seed or ''}", args.recipe, *changed, f"s{args.seed}"]
     return Path(args.runs_dir) / "hvae" / ("-".join(parts) + ".npz")
 
 

@@ -11,7 +11,7 @@ model selection on held-out *validation* actions. The test actions are used once
 
     python ppo_actiongen.py gridworld --quick        # the whole protocol in minutes on a laptop
     python ppo_actiongen.py gridworld                # our recipe, full budget
-    python ppo_actiongen.py gridworld --recipe paper # Tables 3 and 4 to the letter
+    python ppo_actiongen.py gridworld --recipe paper # the policy of Tables 3 and 4 to the letter
     python ppo_actiongen.py gridworld --method nearest-neighbor        # baselines of section 5.3
     python ppo_actiongen.py gridworld --ent-coef 0 | --no-subsample    # ablations
     python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0 # C.2: adapt to the unseen
@@ -98,7 +98,8 @@ class Args:
     split_seed: int = 0
     """Seed of the random split; published: one split for all seeds."""
     recipe: Literal["fast", "paper"] = "fast"
-    """fast = ours, every difference listed in FAST; paper = Tables 3-4 to the letter."""
+    """fast = ours, every difference listed in FAST; paper = the policy's rows of Tables 3-4 to the
+    letter (the encoder's: --hvae-recipe paper, days on a CPU)."""
     quick: bool = False
     """The same protocol at a laptop budget (some minutes)."""
     seed: int = 0
@@ -188,9 +189,11 @@ class Args:
     utility_hidden: int | None = None
     """Hidden width of the utility alone (default: hidden_size; wider is beyond the paper)."""
     explore: float = 0.0
-    """While learning, this share of choices is uniform over those on offer (ours; paper: 0)."""
+    """While learning, this share of choices is uniform over those on offer (ours, method utility;
+    paper: 0)."""
     outcome_coef: float = 0.0
-    """Weight of outcome_loss: what the chosen action led to (ours, utility mlp; paper: 0)."""
+    """Weight of outcome_loss: what the chosen action led to (ours, method utility with utility mlp;
+    paper: 0)."""
 
     stop_bias: float = 0.0
     """Initial logit of going on, against stopping (ours; the paper: 0)."""
@@ -325,9 +328,9 @@ FAST = {
     ),
 }
 
-# --quick: the fast recipe with a smaller budget, never another algorithm.
+# --quick: the fast recipe with a smaller budget; the encoder is hvae.py's quick one.
 QUICK = {
-    "gridworld": dict(total_timesteps=2_000_000, hvae_recipe="quick"),
+    "gridworld": dict(total_timesteps=1_500_000, hvae_recipe="quick"),
     "recsys": dict(total_timesteps=1_000_000),
     "create": dict(total_timesteps=400_000, hvae_recipe="quick", eval_episodes=500),
     "stacking": dict(total_timesteps=60_000, hvae_recipe="quick", eval_episodes=500),
@@ -665,12 +668,13 @@ class Agent(nn.Module):
         distance = table.square().sum(1) - 2 * wish.double() @ table.T  # (B, D) @ (D, A) -> (B, A)
         return distance.gather(1, available).argmin(1)  # (B, K) -> (B,)
 
-    def auxiliary(self, code, noise=None, action=None, taken=None):
+    def auxiliary(self, code, noise=None, action=None, taken=None, greedy=False):
         """f_chi: position ~ Beta on [-1, 1] per dimension, stop ~ Categorical(2).
 
-        Draws them when `action` is None. Returns the heads' values, summed log-probability (B,)
-        and entropy (B,), the position's scaled by `aux_ent_scale`. `taken` (B,), the ids of the
-        chosen actions, is what the position also depends on with --aux-conditioned (C.4).
+        Draws them when `action` is None (greedy: takes the mean position, the likelier of go on and
+        stop). Returns the heads' values, summed log-probability (B,) and entropy (B,), the
+        position's scaled by `aux_ent_scale`. `taken` (B,), the ids of the chosen actions, is what
+        the position also depends on with --aux-conditioned (C.4).
         """
         out, logprob, entropy = {}, 0.0, 0.0
         stop_code = code
@@ -681,7 +685,9 @@ class Agent(nn.Module):
             alpha, beta = 1 + F.softplus(self.fc_alpha(code)), 1 + F.softplus(self.fc_beta(code))
             if action is None:
                 both = torch.stack([alpha, beta], dim=-1)  # (B, d, 2)
-                unit = torch._sample_dirichlet(both, noise)[..., 0]  # a Beta is a 2-way Dirichlet
+                unit = alpha / (alpha + beta)  # (B, d), the mean
+                if not greedy:  # a Beta is a 2-way Dirichlet
+                    unit = torch._sample_dirichlet(both, noise)[..., 0]
                 out["position"] = 2 * unit - 1  # (B, d) in [-1, 1]
             else:
                 out["position"] = action["position"]
@@ -692,7 +698,10 @@ class Agent(nn.Module):
             entropy = entropy + self.aux_ent_scale * dist.entropy().sum(1)
         if self.has_stop:
             logp = F.log_softmax(self.fc_stop(stop_code), dim=1)  # (B, 2)
-            out["stop"] = sample(logp, noise) if action is None else action["stop"]
+            if action is None:
+                out["stop"] = logp.argmax(1) if greedy else sample(logp, noise)
+            else:
+                out["stop"] = action["stop"]
             logprob = logprob + logp.gather(1, out["stop"][:, None])[:, 0]
             entropy = entropy - (logp.exp() * logp).sum(1)
         return out, logprob, entropy
@@ -724,7 +733,9 @@ class Agent(nn.Module):
             action["choice"] = choice
         if self.aux_conditioned:
             action["taken"] = available.gather(1, action["choice"][:, None])[:, 0]  # (B,) ids
-        aux, aux_logprob, _ = self.auxiliary(code, generator, taken=action.get("taken"))
+        aux, aux_logprob, _ = self.auxiliary(
+            code, generator, taken=action.get("taken"), greedy=greedy
+        )
         return action | aux, logprob + aux_logprob, value
 
     def logprob_entropy(self, code, available, action, P):
@@ -786,7 +797,7 @@ class RunningMeanStd:
     def load(self, state: dict) -> None:
         """The inverse of `state`."""
         for key, value in state.items():
-            setattr(self, key, value.numpy().copy() if value.ndim else value.item())
+            setattr(self, key, value.cpu().numpy().copy() if value.ndim else value.item())
 
 
 # ---- environments, pools, representations ----
@@ -910,7 +921,7 @@ class Preprocess:
         """The inverse of `state`."""
         self.stats.load({k: v for k, v in state.items() if k != "ids"})
         if self.one_hot:
-            self.set_ids(state["ids"].numpy())
+            self.set_ids(state["ids"].cpu().numpy())
 
 
 # ---- several processes: `torchrun --nproc_per_node=N ppo_actiongen.py ...` ----
@@ -1219,6 +1230,8 @@ def published_scores(args: Args) -> dict[str, float]:
     path = Path(__file__).parent / "results" / "published_results.csv"
     env = args.env + ("_full" if args.fully_observable else "")
     scores, method = {}, method_name(args).removesuffix("_bilinear")
+    if args.split != "default" and method != "ours_full_split":
+        return {}  # of the other splits only this one was published
     if path.exists():
         for row in csv.DictReader(path.open()):
             same_task = (row["task"] or None) in (args.task, None)
@@ -1362,8 +1375,9 @@ def print_table(results: dict, metric: str) -> None:
 def check(args: Args) -> None:
     """Refuse impossible settings with one line, before anything is written."""
     positive = "num_available total_timesteps minibatch_size num_envs num_minibatches update_epochs"
-    for name in f"{positive} eval_every valid_episodes eval_episodes threads hidden_size".split():
-        if getattr(args, name) < 1:
+    positive += " eval_every valid_episodes eval_episodes threads hidden_size utility_hidden"
+    for name in f"{positive} fixed_set_size eval_available lr_decay_steps".split():
+        if getattr(args, name) is not None and getattr(args, name) < 1:
             raise ValueError(f"{name} {getattr(args, name)} is not allowed; at least 1")
     if args.minibatch_size * args.num_minibatches % args.num_envs:
         raise ValueError(
@@ -1388,9 +1402,13 @@ def check(args: Args) -> None:
         raise ValueError("ent_coef, outcome_coef must be at least 0 and learning_rate above 0")
     if args.task is not None and "task" not in TASK_OPTIONS.get(args.env, ()):
         raise ValueError(f"task {args.task!r}: {args.env} has no tasks")
-    for name in ("fully_observable", "placement"):
-        if getattr(args, name) and name not in TASK_OPTIONS.get(args.env, ()):
+    for name, usual in (("fully_observable", False), ("placement", None), ("subgoal_reward", True)):
+        if getattr(args, name) != usual and name not in TASK_OPTIONS.get(args.env, ()):
             raise ValueError(f"{name} is not an option of {args.env}")
+    if args.outcome_coef and (args.method, args.utility) == ("utility", "bilinear"):
+        raise ValueError("outcome_coef: the bilinear utility has no hidden layer to predict with")
+    if args.one_hot and args.env in ("create", "stacking"):
+        raise ValueError(f"one_hot: the states of {args.env} are pictures")
     if args.adapt and args.method == "continuous":
         raise ValueError("adapt: method 'continuous' is not one of utility, nearest-neighbor")
     if args.aux_conditioned and (args.method, args.utility) != ("utility", "mlp"):
@@ -1412,18 +1430,12 @@ def run_path(args: Args) -> Path:
 
 
 def open_run(args: Args, device) -> tuple[Path, dict | None]:
-    """Make the run's folder, or find the checkpoint to go on from."""
+    """The run's folder, and the checkpoint to go on from; refuses to replace a run unasked."""
     folder = run_path(args)
     if args.resume and (folder / "checkpoint.pt").exists():
         checkpoint = load_checkpoint(folder / "checkpoint.pt", device)
-        free = {"resume", "overwrite", "threads", "device", "tensorboard", "runs_dir", "run_name"}
-        for f in fields(Args):  # a run continues as what it was
-            ours, theirs = getattr(args, f.name), checkpoint["args"].get(f.name)
-            ours = list(ours) if isinstance(ours, tuple) else ours
-            if f.name not in free and ours != theirs:
-                raise ValueError(
-                    f"cannot resume {folder}: {f.name} is {theirs!r} there, {ours!r} here"
-                )
+        for name, theirs, ours in difference(args, checkpoint["args"]):  # a run stays what it was
+            raise ValueError(f"cannot resume {folder}: {name} is {theirs!r} there, {ours!r} here")
         if (ranks := checkpoint["generator"].shape[0]) != WORLD_SIZE:
             raise ValueError(f"cannot resume {folder}: {ranks} processes there, {WORLD_SIZE} here")
         return folder, checkpoint
@@ -1432,14 +1444,23 @@ def open_run(args: Args, device) -> tuple[Path, dict | None]:
             raise ValueError(
                 f"{folder} already holds a run; --resume goes on with it, --overwrite replaces it"
             )
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     return folder, None
 
 
 def plain_args(args: Args) -> dict:
     """Args as JSON-like values (tuples become lists)."""
     return json.loads(json.dumps(asdict(args)))
+
+
+def difference(args: Args, saved: dict) -> list[tuple]:
+    """(field, its value there, its value here) of what a run, saved as `plain_args`, has otherwise.
+
+    How a run is carried out may change from one part of it to the next. A field that did not exist
+    then has its default.
+    """
+    free = {"resume", "overwrite", "threads", "device", "tensorboard", "runs_dir", "run_name"}
+    theirs, ours = plain_args(Args()) | saved, plain_args(args)
+    return [(k, theirs[k], ours[k]) for k in ours if k not in free and theirs[k] != ours[k]]
 
 
 def seeds(args: Args, *path: int) -> int:
@@ -1471,32 +1492,28 @@ class Run:
             )
         self.phases = ("train",) if args.adapt else ("train", "valid", "test")
         self.num_envs = args.num_envs // WORLD_SIZE  # of this process
-        # Rank 0 first: the others find the folder and the representation that it makes.
+        # Cheap things first: a wrong option shows before hours go into an encoder, and the folder
+        # is made, or an old one thrown away, when nothing can be refused any more.
+        self.envs = make_envs(
+            args, self.pool, self.num_envs, self.num_available, seeds(args, 1, 0, RANK)
+        )
+        # Rank 0 first: the others find the representation that it makes.
         for turn in (0, 1):
             problem = None
             if turn == min(RANK, 1):
                 try:
                     self.folder, checkpoint = open_run(args, self.device)
                     table = load_table(args, self.pools["train"])
-                except (ValueError, FileNotFoundError) as e:
+                except (ValueError, OSError) as e:
                     problem = e
             for e in filter(None, gathered(problem)):  # then all of them stop
-                self.leave_nothing()
                 raise e
-        self.envs = make_envs(
-            args, self.pool, self.num_envs, self.num_available, seeds(args, 1, 0, RANK)
-        )
-        try:
-            self.build(table, checkpoint)
-        except (ValueError, FileNotFoundError):
-            self.leave_nothing()
-            raise
-
-    def leave_nothing(self) -> None:
-        """Remove the folder of a refused run if nothing is in it yet."""
-        folder = run_path(self.args)
-        if not RANK and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
+        self.build(table, checkpoint)
+        if not RANK:
+            if args.overwrite and checkpoint is None and self.folder.exists():
+                shutil.rmtree(self.folder)
+            self.folder.mkdir(parents=True, exist_ok=True)
+        gathered(None)  # the folder is there
 
     def build(self, table, checkpoint) -> None:
         """Create (or restore) everything that learns."""
@@ -1529,7 +1546,13 @@ class Run:
         if checkpoint:
             self.agent.load_state_dict(checkpoint["agent"])
             self.optimizer.load_state_dict(checkpoint["optimizer"])
-            self.generator.set_state(checkpoint["generator"][RANK].cpu())
+            noise = checkpoint["generator"][RANK].cpu()
+            if noise.shape != self.generator.get_state().shape:
+                raise ValueError(
+                    f"cannot resume {self.folder}: made on another kind of device than "
+                    f"{self.device.type}; --device names the one it was"
+                )
+            self.generator.set_state(noise)
             self.preprocess.load(checkpoint["preprocess"])
             self.scale.stats.load(checkpoint["reward_stats"])
             self.update_index = checkpoint["update_index"]
@@ -1595,7 +1618,7 @@ def train(args: Args) -> dict:
 
         writer = SummaryWriter(run.folder, purge_step=run.update_index * run.batch_size)
     eval_every = max(1, args.eval_every // run.batch_size)  # in updates
-    lr_updates = (args.lr_decay_steps or args.total_timesteps) // run.batch_size
+    lr_updates = max(1, (args.lr_decay_steps or args.total_timesteps) // run.batch_size)
     # Episodes start afresh at every checkpoint, killed or not, so a resumed run repeats exactly.
     obs, _ = run.envs.reset(seed=seeds(args, 1, run.update_index, RANK))
     bar = tqdm(
@@ -1745,7 +1768,7 @@ class EvaluateArgs:
     seed: int = 0
     """Seed of environments and action sampling."""
     greedy: bool = False
-    """Take the most probable action instead of sampling."""
+    """Take the most probable action, and the mean position, instead of sampling."""
     min_angle_gap: float | None = None
     """CREATE: only tools at least so many degrees from every training tool of their class."""
     min_embedding_distance: str | None = None
@@ -1768,7 +1791,15 @@ def restrict_pool(options: EvaluateArgs, args: Args, table, pool, train_ids) -> 
     An action of both pools (CREATE's no-op) always stays. Raises ValueError for a bad value.
     """
     module = importlib.import_module(MODULES[args.env])
+    chosen = (options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio)
+    if all(choice is None for choice in chosen):
+        return pool
     always, keep = np.isin(pool, train_ids), np.ones(len(pool), bool)
+    if always.all():
+        raise ValueError(
+            f"min_angle_gap, min_embedding_distance and unseen_ratio choose among unseen actions; "
+            f"the run was trained with all {len(pool)} of the {options.actions} actions"
+        )
     if options.min_angle_gap is not None:
         if not hasattr(module, "angle_gaps"):
             raise ValueError(f"min_angle_gap: {args.env} has no angles")
@@ -1807,12 +1838,18 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     saved = {f.name: checkpoint["args"].get(f.name, f.default) for f in fields(Args)}
     saved["utility_gains"] = tuple(saved["utility_gains"])
     args = Args(**saved)
+    if args.env not in MODULES:
+        raise ValueError(f"{options.run}: its environment {args.env!r} is not one of {[*MODULES]}")
+    if options.seed < 0:
+        raise ValueError(f"seed {options.seed} is not allowed; at least 0")
     pools, pool, _ = action_pools(args)
-    if options.actions != "train":
-        pool = pools[options.actions]
+    if options.actions != "train" or args.adapt:  # "train" is what a fixed set was drawn from ...
+        pool = pools[options.actions]  # ... and not what a run has adapted to, test actions
     table, train_ids = (checkpoint["agent"][k].numpy() for k in ("table", "train_ids"))
     pool = restrict_pool(options, args, checkpoint["agent"]["table"], pool, train_ids)
-    K = options.num_available or args.eval_available or args.num_available
+    K = options.num_available
+    if K is None:
+        K = args.eval_available or args.num_available
     if not 1 <= K <= len(pool) or options.episodes < 1:
         raise ValueError(f"num_available {K} is not in 1..{len(pool)}, or episodes is below 1")
     envs = make_envs(args, pool, 1, K, 0)
@@ -1875,7 +1912,7 @@ def main() -> None:
             dist.init_process_group(backend, timeout=timedelta(days=3))
         args = tyro.cli(Args, args=argv[1:], default=default)
         train(replace(args, adapt=args.adapt or args.finetune is not None))
-    except (ValueError, FileNotFoundError) as e:
+    except (ValueError, OSError) as e:
         raise SystemExit(1 if RANK else f"error: {e}") from None
     finally:
         if dist.is_initialized():

@@ -166,8 +166,10 @@ def _check_pool(action_pool: np.ndarray | None, num_available: int) -> np.ndarra
     pool = np.sort(_check_ids(split_actions()["train"] if action_pool is None else action_pool))
     if (repeated := pool[1:][pool[1:] == pool[:-1]]).size:
         raise ValueError(f"action id {repeated[0]} is in the pool twice; allowed: once")
-    if not 1 <= num_available <= len(pool):
-        raise ValueError(f"num_available is {num_available}; allowed: 1..{len(pool)} (the pool)")
+    if not isinstance(num_available, int | np.integer) or not 1 <= num_available <= len(pool):
+        raise ValueError(
+            f"num_available is {num_available!r}; allowed: integers 1..{len(pool)} (the pool)"
+        )
     return pool
 
 
@@ -296,6 +298,8 @@ class RecSysEnv(gym.Env):
         """Recommend one product; returns (observation, reward, terminated, truncated, info)."""
         if self._over:
             raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
+        if np.ndim(action) or np.asarray(action).dtype.kind not in "iu":
+            raise ValueError(f"action is {action!r}; allowed: one integer")
         if not 0 <= action < self.num_available:
             raise ValueError(f"action is {action}; allowed: 0..{self.num_available - 1}")
         product = int(self.available[action])
@@ -365,6 +369,8 @@ class RecSysEnv(gym.Env):
         if self.render_mode is None:
             gym.logger.warn("render() needs render_mode='rgb_array'; nothing is drawn")
             return None
+        if not hasattr(self, "timeline"):
+            raise gym.error.ResetNeeded("call reset() before the first render()")
         ending = ""
         if self._over:
             ending = "the user left" if self.mode == GONE else "time is up"
@@ -434,6 +440,7 @@ class RecSysVectorEnv(VectorEnv):
         self.recommendations, self.clicks = np.zeros((2, num_envs), np.int64)
         self._gone = np.zeros(num_envs, bool)  # left in the session before the first recommendation
         self._clicked = np.zeros((num_envs, num_available), bool)  # positions, for no_repeat_reward
+        self._bank = None  # sets drawn ahead; None until the first reset
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start all episodes anew; returns (observations, {}). A seed reseeds the one generator."""
@@ -476,9 +483,11 @@ class RecSysVectorEnv(VectorEnv):
 
     def step(self, actions: np.ndarray):
         """One recommendation to every user: `actions` int (N,), positions in `available`."""
+        if self._bank is None:
+            raise gym.error.ResetNeeded("call reset() before the first step()")
         actions = np.asarray(actions)
-        if actions.shape != (self.num_envs,):
-            raise ValueError(f"actions have shape {actions.shape}; allowed: ({self.num_envs},)")
+        if actions.shape != (self.num_envs,) or actions.dtype.kind not in "iu":
+            raise ValueError(f"actions are {actions!r}; allowed: {self.num_envs} integers")
         if actions.min() < 0 or actions.max() >= self.num_available:
             raise ValueError(f"actions are {actions}; allowed: 0..{self.num_available - 1}")
         rng = self.np_random
@@ -850,5 +859,5 @@ def main(args: Args) -> None:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None

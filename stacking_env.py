@@ -1022,8 +1022,10 @@ class StackingEnv(gym.Env):
 
     def render(self) -> np.ndarray | None:
         """The scene in colour, (360, 360, 3) uint8 (None without render_mode)."""
-        if self.render_mode is None or not self._bodies:
+        if self.render_mode is None:
             return None
+        if not hasattr(self, "_bodies"):
+            raise ResetNeeded("call reset() before the first render()")
         return colour_picture(self.shape_ids, *self.poses(), caption=self._caption())
 
     def render_frames(self) -> list[np.ndarray]:

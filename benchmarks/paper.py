@@ -25,7 +25,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
 
@@ -532,10 +532,28 @@ def make_encoder(options: str, split_seed: int, args: Args, extra: str = "") -> 
     return Encoder(words, hvae.representation_path(tyro.cli(hvae.Args, args=words)))
 
 
-def encoder_of(run: Run, args: Args) -> Encoder | None:
-    """The encoder whose table this run needs, as `load_table` of ppo_actiongen.py makes it."""
+def args_of(run: Run, args: Args) -> ppo_actiongen.Args:
+    """What ppo_actiongen.py makes of this run's command."""
     preset = ppo_actiongen.default_args(run.words[0], args.recipe, False)
     run_args = tyro.cli(ppo_actiongen.Args, args=run.words[1:], default=preset)
+    return replace(run_args, adapt=run_args.adapt or run_args.finetune is not None)
+
+
+def check_finished(run: Run, args: Args) -> None:
+    """Raise ValueError if the folder holds a run of another command: its scores are not ours."""
+    if not run.finished:
+        return
+    saved = json.loads((run.folder / "args.json").read_text())
+    for name, theirs, ours in ppo_actiongen.difference(args_of(run, args), saved):
+        raise ValueError(
+            f"{run.folder} was made with {name} {theirs!r}, this command has {ours!r}; "
+            "remove the folder or take another --runs-dir"
+        )
+
+
+def encoder_of(run: Run, args: Args) -> Encoder | None:
+    """The encoder whose table this run needs, as `load_table` of ppo_actiongen.py makes it."""
+    run_args = args_of(run, args)
     if run_args.representation not in ("hvae", "hvae-all", "vae"):
         return None
     options = [run_args.env]
@@ -566,6 +584,8 @@ class Plan:
 def plan(args: Args) -> list[Plan]:
     """What each of the chosen experiments consists of; ValueError for an unknown name."""
     names = list(EXPERIMENTS) if args.experiments == ("all",) else args.experiments
+    if not args.seeds:
+        raise ValueError("seeds: at least one is needed")
     plans = []
     for name in names:
         if name not in EXPERIMENTS:
@@ -782,6 +802,8 @@ def run_all(plans: list[Plan], args: Args) -> list[bool]:
     """Encoders, policies, fine-tuned policies, evaluations, pictures: each needs those before."""
     encoders = {e.path: e for p in plans for e in p.encoders}
     runs = {run.folder: run for p in plans for run in p.runs}
+    for run in runs.values():
+        check_finished(run, args)
     tests = defaultdict(list)
     for test in (test for p in plans for test in p.tests):
         tests[test.run.folder].append(test)

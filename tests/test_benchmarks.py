@@ -142,6 +142,23 @@ def test_unknown_names_are_refused(args, word):
 # ---- tables ----
 
 
+def test_a_finished_run_of_another_command_is_not_collected(tmp_path):
+    args = paper.Args(("gridworld",), methods=("engineered",), seeds=(0,), runs_dir=str(tmp_path))
+    ((run,),) = (plan.runs for plan in paper.plan(args))
+    paper.check_finished(run, args)  # nothing there yet
+    run.folder.mkdir()
+    saved = ppo_actiongen.plain_args(paper.args_of(run, args))
+    del saved["explore"]  # made before there was such an option
+    (run.folder / "args.json").write_text(json.dumps(saved))
+    (run.folder / "results.json").write_text("{}")
+    paper.check_finished(run, args)
+    other = paper.Args(**vars(args) | {"extra": "--ent-coef 0.9"})
+    ((same_folder,),) = (plan.runs for plan in paper.plan(other))
+    assert same_folder.folder == run.folder
+    with pytest.raises(ValueError, match="was made with ent_coef 0.05, this command has 0.9"):
+        paper.run_all(paper.plan(other), other)
+
+
 def test_merging_replaces_rows_of_the_same_key_and_keeps_the_rest(tmp_path):
     path, columns = tmp_path / "t.csv", ["method", "seed", "score"]
     first = [dict(method="a", seed=s, score=0.5) for s in (0, 1)]

@@ -693,8 +693,10 @@ def test_vector_reset_with_a_seed_reseeds():
 
 BAD_ARGUMENTS = [
     ({"task": "pull"}, "unknown task 'pull'"),
-    ({"action_pool": [0, 1, 2], "num_available": 4}, "num_available must be 1..3"),
+    ({"action_pool": [0, 1, 2], "num_available": 4}, "num_available must be an integer in 1..3"),
+    ({"action_pool": [1, 2], "num_available": 4}, "num_available must be an integer in 1..3"),
     ({"num_available": 0}, "num_available must be"),
+    ({"num_available": 1.5}, "num_available must be an integer .* got 1.5"),
     ({"action_pool": [0, 1, c.NUM_ACTIONS], "num_available": 2}, "ids must be 0.."),
     ({"action_pool": [-1, 1, 2], "num_available": 2}, "ids must be 0.."),
     ({"action_pool": [1, 1, 2], "num_available": 2}, "1 repeated"),
@@ -741,6 +743,13 @@ def test_bad_actions_change_nothing():
     np.testing.assert_equal(env.step(NO_OP), clean.step(NO_OP))
     with pytest.raises(gymnasium.error.ResetNeeded):
         CreateEnv().step(NO_OP)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        CreateEnv(render_mode="rgb_array").render()
+
+
+def test_a_pool_without_the_no_op_can_be_offered_whole():
+    obs, _ = CreateEnv(action_pool=[5, 3], num_available=3).reset(seed=0)
+    assert obs["available"].tolist() == [0, 3, 5]
 
 
 def check_scene(env: CreateEnv) -> None:

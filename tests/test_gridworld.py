@@ -578,8 +578,8 @@ def test_step_needs_a_reset():
 @pytest.mark.parametrize(
     ("pool", "num_available", "message"),
     [
-        ([1, 2, 3], 4, "num_available is 4; allowed: 1..3"),
-        ([1, 2, 3], 0, "num_available is 0; allowed: 1..3"),
+        ([1, 2, 3], 4, "num_available is 4; allowed: integers 1..3"),
+        ([1, 2, 3], 0, "num_available is 0; allowed: integers 1..3"),
         ([1, 2, 1024], 2, "action id 1024 does not exist; allowed: 0..1023"),
         ([-1, 2, 3], 2, "action id -1 does not exist"),
         ([5, 2, 5], 2, "action id 5 is in the pool twice"),
@@ -593,6 +593,15 @@ def test_bad_pools(build, pool, num_available, message):
         build(np.array(pool), num_available)
 
 
+def test_a_layout_can_be_asked_for():
+    envs, env = make_vec(3), GridWorldEnv()
+    same = gridworld.LAYOUTS[7].copy()
+    same[gridworld.START[0] * gridworld.SIZE + gridworld.START[1]] = gridworld.AGENT
+    states = [*envs.reset(options={"layout": 7})[0]["state"]]
+    states.append(env.reset(options={"layout": np.int64(7)})[0]["state"])
+    assert all(np.array_equal(state, same) for state in states)
+
+
 def test_other_bad_input():
     env = GridWorldEnv(ALL, 50)
     env.reset(seed=0)
@@ -602,14 +611,26 @@ def test_other_bad_input():
         make_vec(0)
     with pytest.raises(ValueError, match="'human'.*'rgb_array'"):
         GridWorldEnv(render_mode="human")
-    with pytest.raises(ValueError, match=r"layout is 42; allowed: 0\.\.41"):
-        env.reset(options={"layout": 42})
+    for layout in (42, -1, 3.0, True, "3"):
+        for world in (env, envs):
+            with pytest.raises(ValueError, match=r"layout is .*; allowed: integers 0\.\.41"):
+                world.reset(options={"layout": layout})
+    for action in (1.5, None, True, [1], "1"):
+        with pytest.raises(ValueError, match="allowed: one integer"):
+            env.step(action)
+    for actions in ([1.0, 2.0], [np.nan, 0], [True, False], [[0, 1]], 0):
+        with pytest.raises(ValueError, match=r"allowed: 2 integers in 0\.\.49"):
+            envs.step(actions)
+    with pytest.raises(ValueError, match="num_available is 20.0"):
+        GridWorldEnv(ALL, 20.0)
+    with pytest.raises(gym.error.ResetNeeded):
+        GridWorldEnv(render_mode="rgb_array").render()
     for action in (-1, 50):
         with pytest.raises(ValueError, match=r"allowed: 0\.\.49"):
             env.step(action)
-        with pytest.raises(ValueError, match=r"allowed: 2 of 0\.\.49"):
+        with pytest.raises(ValueError, match=r"allowed: 2 integers in 0\.\.49"):
             envs.step([0, action])
-    with pytest.raises(ValueError, match=r"allowed: 2 of 0\.\.49"):
+    with pytest.raises(ValueError, match=r"allowed: 2 integers in 0\.\.49"):
         envs.step([0])
     with pytest.raises(ValueError, match="'video'.*xy, onehot"):
         gridworld.action_observations([0], 1, "video")
@@ -756,4 +777,4 @@ def test_script(tmp_path):
     bad = [*command[:2], "--out", str(tmp_path / "no"), "--num-available", "300"]
     done = subprocess.run(bad, capture_output=True, text=True)
     assert done.returncode == 1 and not (tmp_path / "no").exists()
-    assert done.stderr.strip() == "error: num_available is 300; allowed: 1..256 (the pool)"
+    assert done.stderr.strip() == "error: num_available is 300; allowed: integers 1..256 (the pool)"

@@ -366,7 +366,7 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
     oracle = hvae.load_representation(hvae.train(Args(train_on="all", **base)), "gridworld")
     assert oracle["action_ids"].tolist() == list(range(1024))
     path = hvae.train(Args(hierarchical=False, modality="onehot", split_seed=3, **base))
-    assert path.name == "gridworld-onehot-vae-default3-laptop-s0.npz"
+    assert path.name == "gridworld-onehot-vae-default3-laptop-updates=2-observations=8-s0.npz"
     flat = hvae.load_representation(path, "gridworld", split_seed=3)
     assert np.array_equal(flat["action_ids"], gridworld.split_actions("default", 3)["train"])
 
@@ -384,11 +384,24 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
     (dict(split="odd"), "odd"),
     (dict(updates=0), "updates must be at least 1, got 0"),
     (dict(batch_size=-1), "batch_size must be at least 1, got -1"),
+    (dict(encoder="lstm", hidden=63), "hidden 63: .* must be even"),
 ])  # fmt: skip
 def test_bad_choices_are_refused_before_anything_is_written(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words) as error:
         hvae.train(Args(**dict(runs_dir=str(tmp_path)) | changes))
     assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+
+
+def test_only_the_recipes_own_table_has_its_name():
+    def name(**changes):
+        return hvae.representation_path(Args(**changes)).name
+
+    assert name() == name(updates=1_000) == name(threads=2, plots=False, device="cpu")
+    assert name() == "gridworld-xy-hvae-default-laptop-s0.npz"
+    changes = [{}, dict(updates=1), dict(epochs=2), dict(linear_path=False), dict(encoder="lstm")]
+    changes += [dict(learning_rate=0.5), dict(representation_size=4), dict(recipe="lstm")]
+    assert len({name(**change) for change in changes}) == len(changes)
+    assert name(updates=1) == "gridworld-xy-hvae-default-laptop-updates=1-s0.npz"
 
 
 def test_plain_vae_without_a_linear_path_learns_longer():
@@ -627,7 +640,7 @@ def test_command_line_makes_every_file(tmp_path):
     done = run("gridworld", "--updates", 20, "--observations", 64, "--threads", 1,
                "--runs-dir", tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
-    stem = "gridworld-xy-hvae-default-laptop-s0"
+    stem = "gridworld-xy-hvae-default-laptop-updates=20-observations=64-s0"
     endings = (".npz", ".pt", ".csv", "-probe.csv", ".json", "-tsne.png", "-reconstructions.png")
     assert {p.name for p in (tmp_path / "hvae").iterdir()} == {stem + end for end in endings}
     assert "net_r2" in done.stdout and "published" in done.stdout and " 0.946" in done.stdout

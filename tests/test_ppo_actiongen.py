@@ -181,6 +181,20 @@ def test_exploring_mixes_in_uniform_choices_while_learning_only():
     )
 
 
+def test_greedy_takes_the_mean_position_and_the_likelier_of_stop_and_go_on():
+    agent, _ = make_agent(HYBRID)
+    state, sets = torch.randn(64, 7), random_sets(64)
+    P, code = agent.project_actions(), agent.encode(state)[0]
+    played = [
+        agent.act(state, sets, P, torch.Generator().manual_seed(s), greedy=True)[0] for s in (0, 1)
+    ]
+    alpha, beta = (1 + F.softplus(head(code)) for head in (agent.fc_alpha, agent.fc_beta))
+    mean = 2 * torch.distributions.Beta(alpha, beta).mean - 1
+    for action in played:
+        torch.testing.assert_close(action["position"], mean)
+        assert torch.equal(action["stop"], agent.fc_stop(code).argmax(1))
+
+
 def test_hybrid_log_probability_and_entropy_are_sums_of_their_parts():
     agent, args = make_agent(HYBRID)
     state, sets = torch.randn(6, 7), random_sets(6)
@@ -651,9 +665,16 @@ def test_evaluate_a_saved_run(finished, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["ppo_actiongen.py", "evaluate", str(folder), *args])
     ppo.main()
     assert "K=20, 41 episodes" in capsys.readouterr().out
-    monkeypatch.setattr(sys, "argv", [*sys.argv[:3], "--num-available", "257"])
-    with pytest.raises(SystemExit, match="257"):
-        ppo.main()
+    for words, message in (
+        (["--num-available", "257"], "257"),
+        (["--num-available", "0"], "num_available 0 is not in 1..256"),
+        (["--seed", "-1"], "seed -1"),
+        (["--actions", "train", "--unseen-ratio", "0.5"], "choose among unseen actions"),
+        (["--actions", "train", "--min-embedding-distance", "1"], "choose among unseen actions"),
+    ):
+        monkeypatch.setattr(sys, "argv", [*sys.argv[:3], *words])
+        with pytest.raises(SystemExit, match=message):
+            ppo.main()
 
 
 @pytest.mark.parametrize(
@@ -692,6 +713,11 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--placement", "1d"], "placement"),
         (["--minibatch-size", "7"], "multiple of num_envs"),
         (["--micro-batch", "-1"], "micro_batch -1"),
+        (["--utility-hidden", "-1"], "utility_hidden -1"),
+        (["--eval-available", "0"], "eval_available 0"),
+        (["--lr-decay-steps", "0"], "lr_decay_steps 0"),
+        (["--no-subgoal-reward"], "subgoal_reward is not an option of gridworld"),
+        (["--utility", "bilinear", "--outcome-coef", "1"], "no hidden layer"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_leaves_nothing(
@@ -704,6 +730,65 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(
     assert words in str(e.value) and str(e.value).startswith("error: ")
     assert "\n" not in str(e.value)
     assert not any(tmp_path.rglob("*.*"))
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["create", "--task", "bogus"], "unknown task 'bogus'"),
+        (["create", "--one-hot"], "the states of create are pictures"),
+        (["stacking", "--placement", "3d"], "unknown placement '3d'"),
+    ],
+)
+def test_a_wrong_option_shows_before_an_encoder_is_trained(tmp_path, words, message, monkeypatch):
+    monkeypatch.setattr(ppo.hvae, "train", lambda args: pytest.fail("an encoder is trained"))
+    argv = ["ppo_actiongen.py", *words, "--runs-dir", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", argv)
+    with pytest.raises(SystemExit, match=message):
+        ppo.main()
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_refused_overwrite_leaves_the_old_run(finished, monkeypatch):
+    folder, _ = finished
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    extra = ["--overwrite", "--run-name", folder.name, "--representation", "nofile.npz"]
+    monkeypatch.setattr(sys, "argv", command(folder.parent, *extra)[1:])
+    with pytest.raises(SystemExit, match="nofile.npz"):
+        ppo.main()
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+class OnAnotherDevice:
+    """A tensor that, like one on a GPU, only gives its numbers to NumPy after .cpu()."""
+
+    def __init__(self, value):
+        self.value, self.ndim, self.item = value, value.ndim, value.item
+
+    def cpu(self):
+        return self.value
+
+    def numpy(self):
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+
+def test_statistics_load_from_any_device():
+    first, second = ppo.RunningMeanStd((3,)), ppo.RunningMeanStd((3,))
+    first.update(np.random.default_rng(0).normal(size=(50, 3)))
+    second.load({key: OnAnotherDevice(value) for key, value in first.state().items()})
+    assert all(np.array_equal(v, second.state()[k]) for k, v in first.state().items())
+
+
+def test_published_numbers_belong_to_the_default_split_and_the_published_full_split():
+    args = ppo.default_args("create", "fast", False)
+    args.task = "push"
+    assert ppo.published_scores(args)["test"] == pytest.approx(0.797, abs=0.001)
+    args.split = "full"
+    assert ppo.published_scores(args)
+    args.method = "nearest-neighbor"
+    assert ppo.published_scores(args) == {}
+    args.method, args.split, args.representation = "utility", "analysis", "hvae-all"
+    assert ppo.published_scores(args) == {}
 
 
 def test_unknown_environment_and_recipe(monkeypatch):

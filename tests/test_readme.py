@@ -72,6 +72,11 @@ def test_example_of_an_own_environment_learns_unseen_actions(tmp_path):
     results = json.loads((tmp_path / "runs/dial-engineered-s0/results.json").read_text())
     assert results["test"]["score"] > 0.6  # by chance 0.23: 4 moves of 0.4 in 2 pi
     assert (tmp_path / "runs/dial-engineered-s0/episode.gif").exists()
+    test = ["evaluate", "runs/dial-engineered-s0", "--episodes", "300"]
+    run_example('"""Turn a dial', tmp_path, *test)
+    command = [sys.executable, str(ROOT / "ppo_actiongen.py"), *test]  # which knows no dial
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr.startswith("error: ") and "'dial'" in done.stderr
 
 
 def test_example_of_an_own_action_encoder_is_accepted_by_the_policy(tmp_path):

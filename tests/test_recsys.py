@@ -483,7 +483,7 @@ def test_available_changes_per_episode_and_full_pool_keeps_its_order():
 @pytest.mark.parametrize(
     ("pool", "num_available", "message"),
     [
-        (np.arange(5), 6, "num_available is 6; allowed: 1..5"),
+        (np.arange(5), 6, "num_available is 6; allowed: integers 1..5"),
         (np.arange(5), 0, "num_available is 0"),
         ([1, 2, 2], 2, "2 is in the pool twice"),
         ([1, 10_000], 2, "10000 does not exist; allowed: 0..9999"),
@@ -514,8 +514,18 @@ def test_other_bad_input():
             env.step(action)
         with pytest.raises(ValueError, match=r"allowed: 0\.\.4"):
             envs.step(np.array([0, action]))
-    with pytest.raises(ValueError, match=r"allowed: \(2,\)"):
-        envs.step(np.array([0]))
+    for action in (1.5, None, True, [1]):
+        with pytest.raises(ValueError, match="allowed: one integer"):
+            env.step(action)
+    for actions in (np.array([0]), [0.0, 1.0], [np.nan, 0], [True, False]):
+        with pytest.raises(ValueError, match="allowed: 2 integers"):
+            envs.step(actions)
+    with pytest.raises(gym.error.ResetNeeded):
+        make_vec(2, SMALL, 5, 0).step([0, 0])
+    with pytest.raises(ValueError, match="num_available is 5.0"):
+        RecSysEnv(SMALL, 5.0)
+    with pytest.raises(gym.error.ResetNeeded):
+        RecSysEnv(SMALL, 5, render_mode="rgb_array").render()
     with pytest.raises(ValueError, match="unknown policy 'best'"):
         recsys.reference_ctr("best", SMALL, 5, 10, 0)
     with pytest.raises(ValueError, match="episodes is 0"):
