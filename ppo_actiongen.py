@@ -103,7 +103,7 @@ class Args:
     quick: bool = False
     """The same protocol at a laptop budget (some minutes)."""
     seed: int = 0
-    """One seed gives one run, bit for bit on one machine."""
+    """One seed gives one run, bit for bit on one machine (a GPU adds up in no fixed order)."""
 
     # Task options, each for the environments that have it
     task: str | None = None
@@ -226,7 +226,7 @@ class Args:
     overwrite: bool = False
     """Throw away a run of the same name."""
     device: str = "auto"
-    """auto | cpu | cuda."""
+    """auto | cpu | cuda; auto takes a GPU if there is one."""
     threads: int = 2
     """CPU threads of the update (torchrun: of each process, default 1)."""
     micro_batch: int = 0

@@ -525,6 +525,20 @@ def same_weights(a, b):
     return all(torch.equal(a[k], b[k]) for k in a)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
+@pytest.mark.parametrize("words", [[], ["--recipe", "paper"], ["--method", "continuous"]])
+def test_a_run_on_a_gpu_goes_on_and_is_tested(tmp_path, words):
+    words = ["--device", "cuda", "--run-name", "one", *words]
+    assert run(command(tmp_path, *words)).returncode == 0
+    (tmp_path / "one" / "results.json").unlink()
+    again = run(command(tmp_path, *words, "--resume"))
+    assert again.returncode == 0, again.stderr
+    test = [sys.executable, str(ROOT / "ppo_actiongen.py"), "evaluate", str(tmp_path / "one")]
+    assert run([*test, "--episodes", "32"]).returncode == 0  # on the CPU
+    elsewhere = run(command(tmp_path, *words, "--resume", "--device", "cpu"))
+    assert "another kind of device" in elsewhere.stderr
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """One finished tiny run."""
