@@ -1209,14 +1209,19 @@ def method_name(args: Args) -> str:
         return "ours_bilinear"  # beyond the paper
     if not modality_is_default:
         return "ours_video" if args.modality == "video" else "ours_alternate_modality"
-    variants = {
+    return next(iter(variants(args)), "ours")
+
+
+def variants(args: Args) -> list[str]:
+    """The published variants of the task or of our policy that these options ask for."""
+    chosen = {
         "ours_full_split": args.split == "full",
         "ours_conditioned_auxiliary": args.aux_conditioned,
         "ours_no_subgoal_reward": not args.subgoal_reward,
         "ours_no_place": args.placement == "none",
         "ours_2d_place": args.placement == "2d",
     }
-    return next((name for name, chosen in variants.items() if chosen), "ours")
+    return [name for name, is_chosen in chosen.items() if is_chosen]
 
 
 def experiment_name(args: Args) -> str:
@@ -1230,8 +1235,9 @@ def published_scores(args: Args) -> dict[str, float]:
     path = Path(__file__).parent / "results" / "published_results.csv"
     env = args.env + ("_full" if args.fully_observable else "")
     scores, method = {}, method_name(args).removesuffix("_bilinear")
-    if args.split != "default" and method != "ours_full_split":
-        return {}  # of the other splits only this one was published
+    # Each variant was published alone and of our policy; analysis is a split without such numbers.
+    if variants(args) not in ([], [method]) or args.split not in ("default", "full"):
+        return {}
     if path.exists():
         for row in csv.DictReader(path.open()):
             same_task = (row["task"] or None) in (args.task, None)

@@ -793,7 +793,7 @@ def test_statistics_load_from_any_device():
     assert all(np.array_equal(v, second.state()[k]) for k, v in first.state().items())
 
 
-def test_published_numbers_belong_to_the_default_split_and_the_published_full_split():
+def test_published_numbers_stand_only_beside_what_was_published():
     args = ppo.default_args("create", "fast", False)
     args.task = "push"
     assert ppo.published_scores(args)["test"] == pytest.approx(0.797, abs=0.001)
@@ -803,6 +803,14 @@ def test_published_numbers_belong_to_the_default_split_and_the_published_full_sp
     assert ppo.published_scores(args) == {}
     args.method, args.split, args.representation = "utility", "analysis", "hvae-all"
     assert ppo.published_scores(args) == {}
+    args.split, args.representation, args.subgoal_reward = "full", "hvae", False
+    assert ppo.published_scores(args) == {}
+    stacking = ppo.default_args("stacking", "fast", False)
+    for placement, there in (("1d", True), ("2d", False)):
+        stacking.placement, stacking.representation = placement, "engineered"
+        assert bool(ppo.published_scores(stacking)) == there
+        stacking.representation = "hvae"
+        assert ppo.published_scores(stacking)
 
 
 def test_unknown_environment_and_recipe(monkeypatch):
