@@ -464,19 +464,34 @@ class FactorisedUtility(torch.autograd.Function):
     The hidden layer of f_nu acts on the concatenation [state code; projected action], so its
     product splits into W_s s + W_c (A c + a): a state part u, once per state, and an action part
     P, once per action *of the whole table*. What is left per (state, action) pair is an addition,
-    a ReLU and a dot product: memory traffic. Two ideas keep that cheap:
+    a ReLU and a dot product: memory traffic. Four ideas keep that cheap:
       - pieces of about 3 MB stay in the processor's cache through all their passes;
       - the backward pass computes the hidden layer again instead of storing B*K*H numbers, and
-        writes in place (relu, sign, scale) what plain autograd would allocate each time.
+        writes in place what plain autograd would allocate each time;
+      - relu(x) is x where the ReLU is open and 0 elsewhere, so the gradient of w follows from
+        those of u and P (see backward), without a pass of its own;
+      - where every set is the whole table (w/o sub-sampling, C.2), nothing has to be gathered and
+        scattered but numbers: sets only differ in their order.
     tests/ hold the plain concatenation as its oracle.
     """
 
     @staticmethod
-    def hidden(u, P, available):
-        """relu(u + P[available]) of one piece: (b, H), (A, H), (b, K) -> (b, K, H)."""
+    def add(u, P, available):
+        """u + P[available] of one piece: (b, H), (A, H), (b, K) -> (b, K, H).
+
+        Where K reaches A: u + P, all actions in the table's order (b, A, H).
+        """
         b, K = available.shape
+        if K >= len(P):
+            return u[:, None] + P
         x = P.index_select(0, available.reshape(-1)).view(b, K, -1)  # (b*K, H) -> (b, K, H)
-        return x.add_(u[:, None]).relu_()
+        return x.add_(u[:, None])
+
+    @staticmethod
+    def logits(u, P, w, available):
+        """One piece: u (b, H), P (A, H), w (H,), available (b, K) -> (b, K)."""
+        logits = FactorisedUtility.add(u, P, available).relu_() @ w
+        return logits.gather(1, available) if available.shape[1] >= len(P) else logits
 
     @staticmethod
     def forward(ctx, u, P, w, available, workers):
@@ -486,30 +501,39 @@ class FactorisedUtility(torch.autograd.Function):
         logits = u.new_empty(available.shape)  # (B, K)
 
         def piece(rows):
-            logits[rows] = FactorisedUtility.hidden(u[rows], P, available[rows]) @ w
+            logits[rows] = FactorisedUtility.logits(u[rows], P, w, available[rows])
 
         FactorisedUtility.run(piece, u, available, workers)
         return logits
 
     @staticmethod
     def backward(ctx, grad):
-        """Gradient of the logits (B, K) -> gradients of u, P and w."""
+        """Gradient of the logits (B, K) -> gradients of u, P and w.
+
+        With g the gradient of a logit and x = u + P the sum under its ReLU, every open unit h
+        passes g w_h on to u_h and P_h, and gives w_h its g x_h = g u_h + g P_h. So with G_u and G_P
+        the sums of g over the open units, for each state and each action:
+            dL/du = G_u w,   dL/dP = G_P w,   dL/dw = sum_b u G_u + sum_a P G_P.
+        """
         u, P, w, available = ctx.saved_tensors
-        grad_u = torch.empty_like(u)
-        H = u.shape[1]
+        G_u = torch.empty_like(u)
 
-        def piece(rows, dP, dw):
-            g = grad[rows]  # (b, K)
-            x = FactorisedUtility.hidden(u[rows], P, available[rows])  # (b, K, H)
-            dw += g.reshape(-1) @ x.view(-1, H)
-            active = x.sign_()  # 1 where the ReLU is open, else 0
-            grad_u[rows] = torch.bmm(g[:, None], active)[:, 0] * w  # (b,1,K) @ (b,K,H) -> (b,H)
-            active.mul_(g[..., None])
-            dP.index_add_(0, available[rows].reshape(-1), active.view(-1, H))
+        def piece(rows, G_P):
+            g, sets = grad[rows], available[rows]  # 2 x (b, K)
+            whole = sets.shape[1] >= len(P)
+            if whole:  # into the table's order
+                g = g.new_zeros(len(g), len(P)).scatter_add_(1, sets, g)  # (b, A)
+            x = FactorisedUtility.add(u[rows], P, sets).gt_(0)  # (b, K, H): 1 where open, else 0
+            G_u[rows] = torch.bmm(g[:, None], x)[:, 0]  # (b, 1, K) @ (b, K, H) -> (b, H)
+            x.mul_(g[..., None])
+            if whole:
+                G_P += x.sum(0)  # (b, A, H) -> (A, H)
+            else:
+                G_P.index_add_(0, sets.reshape(-1), x.view(-1, x.shape[2]))  # (b*K, H) -> (A, H)
 
-        sums = FactorisedUtility.run(piece, u, available, ctx.workers, P, w)
-        grad_P, grad_w = (sum(parts) for parts in zip(*sums, strict=True))
-        return grad_u, grad_P * w, grad_w, None, None
+        (parts,) = zip(*FactorisedUtility.run(piece, u, available, ctx.workers, P), strict=True)
+        G_P = sum(parts)
+        return G_u * w, G_P * w, (u * G_u).sum(0) + (P * G_P).sum(0), None, None
 
     @staticmethod
     def run(piece, u, available, workers, *like):
@@ -631,7 +655,7 @@ class Agent(nn.Module):
         if torch.is_grad_enabled():
             logits = FactorisedUtility.apply(u, P, w, available, self.workers)
         else:
-            logits = FactorisedUtility.hidden(u, P, available) @ w
+            logits = FactorisedUtility.logits(u, P, w, available)
         return logits + self.utility_out.bias
 
     def predict_outcome(self, code, taken, P):
@@ -758,8 +782,14 @@ class Agent(nn.Module):
 
 
 def sample(logp: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """One draw per row from log-probabilities (B, K): the first of K exponential clocks to ring."""
-    return (logp.exp() / torch.empty_like(logp).exponential_(generator=generator)).argmax(1)
+    """One draw per row from log-probabilities (B, K) -> (B,).
+
+    A uniform number falls between two of the sums p_1, p_1 + p_2, ...; one number per row, where
+    torch.multinomial or Gumbel noise draw K. In float64, so that rare actions keep their share.
+    """
+    cdf = logp.exp().cumsum(1, dtype=torch.float64)  # (B, K)
+    u = torch.rand(len(cdf), 1, generator=generator, dtype=cdf.dtype, device=cdf.device)
+    return torch.searchsorted(cdf, u * cdf[:, -1:], right=True)[:, 0]  # the first sum above it
 
 
 def gaussian_logprob(x, mean, std):

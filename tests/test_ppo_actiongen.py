@@ -90,13 +90,29 @@ def test_factorised_utility_equals_the_concatenation(B, K, width):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
-def test_utility_pieces_and_workers_do_not_change_the_result():
-    agent, _ = make_agent()
-    u, P, w = torch.randn(3000, 64), torch.randn(30, 64), torch.randn(64)
-    sets = random_sets(3000)  # more rows than one piece holds
-    for count in (1, 2, 3):
-        logits = ppo.FactorisedUtility.apply(u, P, w, sets, ppo.Workers(count))
-        torch.testing.assert_close(logits, torch.relu(u[:, None] + P[sets]) @ w)
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("on_offer", ["some", "all", "repeats"])
+def test_utility_pieces_and_workers_do_not_change_the_result(count, on_offer):
+    noise = torch.Generator().manual_seed(0)
+    shapes = (3000, 64), (30, 64), (64,)  # more rows than one piece holds
+    u, P, w = (torch.randn(s, generator=noise, dtype=torch.float64) for s in shapes)
+    if on_offer == "repeats":
+        sets = torch.randint(30, (3000, 30), generator=noise)
+    else:  # all: w/o sub-sampling every set is the whole table, in an order of its own
+        K = 5 if on_offer == "some" else 30
+        sets = torch.rand(3000, 30, generator=noise).argsort(1)[:, :K]
+    weights = torch.randn(sets.shape, generator=noise, dtype=torch.float64)
+    results = []
+    for factorised in (True, False):
+        leaves = [x.clone().requires_grad_() for x in (u, P, w)]
+        if factorised:
+            logits = ppo.FactorisedUtility.apply(*leaves, sets, ppo.Workers(count))
+        else:
+            logits = torch.relu(leaves[0][:, None] + leaves[1][sets]) @ leaves[2]
+        (logits * weights).sum().backward()
+        results.append([logits.detach(), *(leaf.grad for leaf in leaves)])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b)
 
 
 @pytest.mark.parametrize("form", ["mlp", "bilinear"])
@@ -224,6 +240,9 @@ def test_sampling_follows_the_probabilities():
     logp = torch.tensor([0.1, 0.2, 0.7]).log().expand(60_000, 3)
     counts = torch.bincount(ppo.sample(logp, torch.Generator().manual_seed(0)), minlength=3)
     assert np.allclose(counts / 60_000, [0.1, 0.2, 0.7], atol=0.01)
+    logp = torch.tensor([0.0, 0.5, 0.0, 0.5, 0.0]).log().expand(10_000, 5)
+    drawn = ppo.sample(logp, torch.Generator().manual_seed(0)).unique()
+    assert drawn.tolist() == [1, 3]  # never what has no probability
 
 
 def test_nearest_neighbour_maps_the_training_action_to_the_nearest_on_offer():
