@@ -1043,7 +1043,8 @@ def gae(rewards, values, dones, next_value, gamma, lam):
 
 def explained_variance(values, returns) -> float:
     """1 - Var[return - V] / Var[return] over the rollout: 1 a perfect critic, 0 a useless one."""
-    values, returns = (np.concatenate(gathered(x.ravel())) for x in (values, returns))  # (T*N,)
+    pair = (x.flatten().cpu().double().numpy() for x in (values, returns))  # 2 x (T*N,)
+    values, returns = (np.concatenate(gathered(x)) for x in pair)
     spread = returns.var()
     return float(1 - (returns - values).var() / spread) if spread else math.nan
 
@@ -1641,6 +1642,27 @@ class Run:
         return evaluate(self.agent, self.preprocess, self.args, pool, episodes, seed, K)
 
 
+def add_targets(run: Run, batch: dict, obs: dict) -> None:
+    """Add what PPO learns from, all (T, N): advantages and returns, and what outcome_loss predicts.
+
+    `obs` is what follows the rollout. Rewards are scaled, for training only.
+    """
+    args = run.args
+    rewards, dones = batch["reward"].double().numpy(), batch["done"].numpy()  # 2 x (T, N)
+    if args.norm_reward and not run.agent.encoder.is_image:
+        rewards = run.scale(rewards, dones)
+    values = batch["value"].cpu().double().numpy()
+    with torch.no_grad():
+        next_value = run.agent.encode(run.preprocess(obs["state"]).to(run.device))[1]
+    next_value = next_value.cpu().double().numpy()  # (N,)
+    advantages = gae(rewards, values, dones, next_value, args.gamma, args.gae_lambda)
+    targets = {"advantage": advantages, "return": advantages + values}
+    if hasattr(run.agent, "outcome"):
+        after = np.concatenate([values[1:], next_value[None]])  # V(s'), (T, N)
+        targets |= {"q": rewards + args.gamma * (1.0 - dones) * after, "over": dones}
+    batch |= {k: torch.as_tensor(v, dtype=torch.float32) for k, v in targets.items()}
+
+
 def train(args: Args) -> dict:
     """Algorithm 1 and the final test; returns what results.json holds."""
     run = Run(args)
@@ -1679,22 +1701,7 @@ def train(args: Args) -> dict:
             run.module.METRIC,
         )  # fmt: skip
 
-        # Advantages, on rewards scaled for training only.
-        rewards, dones = batch["reward"].double().numpy(), batch["done"].numpy()  # (T, N)
-        if args.norm_reward and not run.agent.encoder.is_image:
-            rewards = run.scale(rewards, dones)
-        values = batch["value"].cpu().double().numpy()
-        with torch.no_grad():
-            next_value = run.agent.encode(run.preprocess(obs["state"]).to(run.device))[1]
-        next_value = next_value.cpu().double().numpy()  # (N,)
-        advantages = gae(rewards, values, dones, next_value, args.gamma, args.gae_lambda)
-        batch["advantage"] = torch.as_tensor(advantages, dtype=torch.float32)
-        batch["return"] = torch.as_tensor(advantages + values, dtype=torch.float32)
-        if hasattr(run.agent, "outcome"):
-            after = np.concatenate([values[1:], next_value[None]])  # V(s'), (T, N)
-            q = rewards + args.gamma * (1.0 - dones) * after
-            batch["q"] = torch.as_tensor(q, dtype=torch.float32)
-            batch["over"] = torch.as_tensor(dones, dtype=torch.float32)
+        add_targets(run, batch, obs)
 
         # Learn, then let the normaliser catch up with what was seen.
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
@@ -1716,7 +1723,7 @@ def train(args: Args) -> dict:
             "episode_score": float(scores.mean()),
             "episode_return": float(returns.mean()),
             "episode_length": float(lengths.mean()),
-            "explained_variance": explained_variance(values, advantages + values),
+            "explained_variance": explained_variance(batch["value"], batch["return"]),
             "learning_rate": lr,
         }
         at_end = run.update_index == run.num_updates

@@ -115,8 +115,6 @@ def _learner(env: str, **changes):
     import tempfile
     from dataclasses import replace
 
-    import torch
-
     import ppo_actiongen as ppo
 
     args = replace(ppo.default_args(env, changes.pop("recipe", "paper"), False), **changes)
@@ -130,11 +128,7 @@ def _learner(env: str, **changes):
         nonlocal obs
         parts = run.num_steps, run.generator, run.device, run.module.METRIC
         batch, obs, _ = ppo.rollout(run.envs, obs, run.agent, run.preprocess, *parts)
-        shape = batch["logprob"].shape
-        rewards, dones = batch["reward"].double().numpy(), batch["done"].numpy()
-        adv = ppo.gae(rewards, batch["value"].double().numpy(), dones, 0 * rewards[0], 0.99, 0.95)
-        batch["advantage"] = torch.as_tensor(adv, dtype=torch.float32)
-        batch["return"] = torch.zeros(shape)
+        ppo.add_targets(run, batch, obs)
         return batch
 
     def update(batch):

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import tyro
 
 ROOT = Path(__file__).parent.parent
@@ -308,6 +309,18 @@ def test_throughput_refuses_unknown_groups(monkeypatch):
     assert {"gridworld", "recsys", "create", "stacking", "hvae", "utility", "learner"} <= set(
         throughput.GROUPS
     )
+
+
+@pytest.mark.parametrize("recipe", ["paper", "fast"])
+@pytest.mark.parametrize("env", ["gridworld", "recsys", "create", "stacking"])
+def test_throughput_can_act_and_learn_in_every_environment(env, recipe):
+    few = dict(num_envs=2, minibatch_size=2, num_minibatches=2, num_available=5, threads=1)
+    run, rollout, update = throughput._learner(env, recipe=recipe, **few)
+    before = [p.clone() for p in run.agent.parameters()]
+    update(rollout())
+    run.envs.close()
+    after = run.agent.parameters()
+    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
 
 
 # ---- for real, at tiny budgets ----

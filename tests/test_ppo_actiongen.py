@@ -344,11 +344,11 @@ def test_a_full_batch_update_follows_the_gradient_of_the_naive_loss(outcome_coef
 
 
 def test_explained_variance_of_perfect_useless_and_harmful_critics():
-    returns = np.random.default_rng(0).normal(size=(8, 4))
+    returns = torch.randn(8, 4, generator=torch.Generator().manual_seed(0))
     assert ppo.explained_variance(returns + 3, returns) == pytest.approx(1)  # a shift is no matter
-    assert ppo.explained_variance(np.full((8, 4), 7.0), returns) == pytest.approx(0)
+    assert ppo.explained_variance(torch.full((8, 4), 7.0), returns) == pytest.approx(0)
     assert ppo.explained_variance(-returns, returns) == pytest.approx(-3)
-    assert math.isnan(ppo.explained_variance(returns, np.ones((8, 4))))
+    assert math.isnan(ppo.explained_variance(returns, torch.ones(8, 4)))
 
 
 # ---- image states ----
