@@ -692,9 +692,12 @@ def file_of(env: str) -> str:
 
 
 def collect_run(run: Run, results_dir: Path) -> None:
-    """Write one finished run into the tables."""
+    """Write one finished run into the tables.
+
+    A run made again otherwise (--extra) takes the place of the first: it is not one more seed.
+    """
     scores, curve = rows_of(run)
-    key = ("env", "method", "seed", "command")
+    key = ("env", "method", "seed", "steps")
     merge(results_dir / f"{file_of(run.env)}.csv", COLUMNS, scores, key)
     if run.method in ADAPT:
         merge(results_dir / "fig9_curves.csv", ADAPT_COLUMNS, adaptation_of(run), key[:3])

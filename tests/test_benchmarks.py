@@ -209,6 +209,10 @@ def test_a_finished_adaptation_has_one_phase_and_a_curve(tmp_path):
         float(r["episode_score"]) for r in curve
     )
     assert not (tmp_path / "gridworld_curves.csv").exists()
+    run.words += ["--valid-episodes", "9"]  # another command, the same seed: no second one
+    paper.collect_run(run, tmp_path)
+    (row,) = csv.DictReader((tmp_path / "gridworld.csv").open())
+    assert row["command"] == run.command != rows[0]["command"]
 
 
 # ---- the report ----
