@@ -26,6 +26,7 @@ import sys
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from threading import Lock
 
@@ -313,7 +314,7 @@ EXPERIMENTS |= {
 RATES = {  # environment steps per second of one run on one core: benchmarks/throughput.py
     "gridworld": 15_000,
     "recsys": 4_600,
-    "create": 900,
+    "create": 800,
     "stacking": 100,
 }
 WIDE_RATE = 4_000  # Grid World with the fast recipe's networks, as measured by its runs
@@ -380,8 +381,9 @@ class Args:
     """Environment steps per second of one run, instead of RATES."""
     runs_dir: str = "runs/paper"
     """Where the runs live."""
-    results_dir: str = "results"
-    """Where the tables go."""
+    results_dir: str | None = None
+    """Where the tables go (default: results; of other recipes, results-<recipes>: their rows are
+    not further seeds of the same thing)."""
 
 
 # ---- from experiments to commands ----
@@ -408,8 +410,25 @@ class Encoder:
 
     @property
     def hours(self) -> float:
-        modality = self.path.name.split("-")[1]  # <env>-<modality>-...
-        return ENCODER_HOURS[self.words[0], modality]
+        """Measured for the laptop recipe; another one's share of observations for the others."""
+        wanted = tyro.cli(hvae.Args, args=self.words)
+        usual = replace(
+            hvae.Args(env=wanted.env, modality=wanted.modality, hierarchical=wanted.hierarchical),
+            recipe="lstm" if wanted.recipe == "lstm" else "laptop",
+        )
+        seen = [observations_seen(options) for options in (wanted, usual)]
+        known = ENCODER_HOURS.get((wanted.env, hvae.resolve(usual).modality), 0.06)
+        return known * seen[0] / seen[1]
+
+
+def observations_seen(options: hvae.Args) -> int:
+    """How many observations an encoder's training reads, the same one counted each time."""
+    options = hvae.resolve(options)
+    module = hvae.load_environment(options.env)
+    train = len(module.split_actions(options.split, options.split_seed)["train"])
+    actions = min(options.batch_size, train)
+    updates = options.updates or options.epochs * (train // actions)
+    return updates * actions * options.batch_observations
 
 
 @dataclass
@@ -424,6 +443,7 @@ class Run:
     folder: Path
     start: "Run | None" = None  # the run whose policy is fine-tuned
     rate: float = 1.0
+    recipe: str = "fast"
 
     @property
     def key(self) -> Path:
@@ -439,7 +459,11 @@ class Run:
 
     @property
     def hours(self) -> float:
-        return self.steps / self.rate / 3600
+        """Training, and at most (episodes of full length) that for all evaluations."""
+        run_args = args_of(self)
+        episodes = 2 * run_args.valid_episodes * (self.steps // run_args.eval_every + 1)
+        episodes += 3 * run_args.eval_episodes
+        return (self.steps + episodes * EPISODE[run_args.env]) / self.rate / 3600
 
 
 @dataclass
@@ -492,6 +516,10 @@ def make_run(env: str, method: str, seed: int, args: Args) -> Run:
         at = words.index("--budget")
         budget *= float(words[at + 1])
         del words[at : at + 2]
+    if args.recipe == "paper":  # the widths are Table 4's
+        for flag in {"--hidden-size", "--utility-hidden"} & set(words):
+            at = words.index(flag)
+            del words[at : at + 2]
     start = None
     for i, word in enumerate(words):
         if word.startswith("{"):
@@ -508,11 +536,12 @@ def make_run(env: str, method: str, seed: int, args: Args) -> Run:
     if args.hvae_recipe != "laptop":  # the last one counts
         words += ["--hvae-recipe", args.hvae_recipe]
         name += f"-{args.hvae_recipe}"
-    wide = words[0] == "gridworld" and "--hidden-size" not in words
+    wide = words[0] == "gridworld" and "--hidden-size" not in words and args.recipe == "fast"
     rates = RATES | ({"gridworld": WIDE_RATE} if wide else {})
     whole = {"--no-subsample", "--adapt", "--finetune"} & set(words) and "--method" not in words
     rate = args.rate or (rates | (WHOLE_RATES if whole else {}))[words[0]]
-    return Run(env, method, seed, words, steps, Path(args.runs_dir) / name, start, rate)
+    folder = Path(args.runs_dir) / name
+    return Run(env, method, seed, words, steps, folder, start, rate, args.recipe)
 
 
 def make_test(experiment: str, run: Run, options: str, args: Args) -> Test:
@@ -537,19 +566,25 @@ def make_encoder(options: str, split_seed: int, args: Args, extra: str = "") -> 
     return Encoder(words, hvae.representation_path(tyro.cli(hvae.Args, args=words)))
 
 
-def args_of(run: Run, args: Args) -> ppo_actiongen.Args:
+def args_of(run: Run) -> ppo_actiongen.Args:
     """What ppo_actiongen.py makes of this run's command."""
-    preset = ppo_actiongen.default_args(run.words[0], args.recipe, False)
-    run_args = tyro.cli(ppo_actiongen.Args, args=run.words[1:], default=preset)
+    return parse(run.recipe, *run.words)
+
+
+@cache  # 20 ms, and asked for several times
+def parse(recipe: str, env: str, *words: str) -> ppo_actiongen.Args:
+    """Args of the flags `words` on top of the recipe's."""
+    preset = ppo_actiongen.default_args(env, recipe, False)
+    run_args = tyro.cli(ppo_actiongen.Args, args=words, default=preset)
     return replace(run_args, adapt=run_args.adapt or run_args.finetune is not None)
 
 
-def check_finished(run: Run, args: Args) -> None:
+def check_finished(run: Run) -> None:
     """Raise ValueError if the folder holds a run of another command: its scores are not ours."""
     if not run.finished:
         return
     saved = json.loads((run.folder / "args.json").read_text())
-    for name, theirs, ours in ppo_actiongen.difference(args_of(run, args), saved):
+    for name, theirs, ours in ppo_actiongen.difference(args_of(run), saved):
         raise ValueError(
             f"{run.folder} was made with {name} {theirs!r}, this command has {ours!r}; "
             "remove the folder or take another --runs-dir"
@@ -558,7 +593,7 @@ def check_finished(run: Run, args: Args) -> None:
 
 def encoder_of(run: Run, args: Args) -> Encoder | None:
     """The encoder whose table this run needs, as `load_table` of ppo_actiongen.py makes it."""
-    run_args = args_of(run, args)
+    run_args = args_of(run)
     if run_args.representation not in ("hvae", "hvae-all", "vae"):
         return None
     options = [run_args.env]
@@ -588,7 +623,8 @@ class Plan:
 
 def plan(args: Args) -> list[Plan]:
     """What each of the chosen experiments consists of; ValueError for an unknown name."""
-    names = list(EXPERIMENTS) if args.experiments == ("all",) else args.experiments
+    of_all = [name for name in EXPERIMENTS if args.recipe == "fast" or name not in RECIPES]
+    names = of_all if args.experiments == ("all",) else args.experiments
     if not args.seeds:
         raise ValueError("seeds: at least one is needed")
     plans = []
@@ -597,6 +633,10 @@ def plan(args: Args) -> list[Plan]:
             raise ValueError(f"experiment {name!r} is not one of {', '.join(EXPERIMENTS)}, all")
         e, runs, tests = EXPERIMENTS[name], {}, []
         known = list(dict.fromkeys(m for methods in e.runs.values() for m in methods))
+        if args.recipe == "paper" and known:
+            known = [m for m in known if m not in BEYOND and name not in RECIPES]
+            if not known:
+                raise ValueError(f"{name} is about the fast recipe; there is none for paper")
         for method in args.methods if known else ():
             if method not in known:
                 raise ValueError(f"method {method!r} is not one of {', '.join(known)}")
@@ -713,7 +753,7 @@ def collect_test(test: Test, results_dir: Path) -> None:
     """Write one evaluation into the table of its experiment."""
     steps = json.loads((test.run.folder / "results.json").read_text())["steps"]
     row = test.row() | identity(test.run) | {"steps": steps, "command": test.command}
-    key = ("env", "method", "seed", "steps", *OPTIONS)
+    key = ("env", "method", "seed", "steps", *(o for o in OPTIONS if o != "episodes"))
     merge(results_dir / f"{test.experiment}.csv", TEST_COLUMNS, [row], key)
 
 
@@ -811,7 +851,7 @@ def run_all(plans: list[Plan], args: Args) -> list[bool]:
     encoders = {e.path: e for p in plans for e in p.encoders}
     runs = {run.folder: run for p in plans for run in p.runs}
     for run in runs.values():
-        check_finished(run, args)
+        check_finished(run)
     tests = defaultdict(list)
     for test in (test for p in plans for test in p.tests):
         tests[test.run.folder].append(test)
@@ -852,6 +892,9 @@ def show(plans: list[Plan]) -> None:
 def main() -> None:
     """Print or run the commands."""
     args = tyro.cli(Args)
+    if args.results_dir is None:
+        recipes = args.recipe.replace("fast", ""), args.hvae_recipe.replace("laptop", "")
+        args.results_dir = "-".join(["results", *filter(None, recipes)])
     try:
         plans = plan(args)
         if args.dry_run:

@@ -2,6 +2,7 @@
 
     python benchmarks/report.py            # results/*.png and the tables in README.md
     python benchmarks/report.py --check    # exit 1 if README.md disagrees with the CSV files
+    python benchmarks/report.py results-paper   # only the pictures, of and in another folder
 
 One picture results/<experiment>.png per figure or analysis of benchmarks/paper.py, and one table
 between the markers of that name in README.md. What has no results yet is left out.
@@ -27,7 +28,7 @@ import paper  # noqa: E402
 
 import ppo_actiongen  # noqa: E402
 
-RESULTS = ROOT / "results"
+RESULTS = PUBLISHED = ROOT / "results"
 
 # Order and labels of the methods in tables and figures.
 METHODS = {
@@ -147,7 +148,7 @@ def published(env: str) -> dict[tuple[str, str], tuple[float, float, int]]:
     name, _, task = env.partition("-") if env.startswith("create-") else (env, "", "")
     rows = [
         r
-        for r in read(RESULTS / "published_results.csv")
+        for r in read(PUBLISHED / "published_results.csv")
         if (r["env"], r["task"]) == (name.replace("-", "_"), task)
     ]
     return {
@@ -183,6 +184,17 @@ def spread(values: list[float], digits: int = 3) -> str:
 def millions(rows: list[dict]) -> str:
     """The number of steps of these rows, as the tables write it: 10M, 0.04M."""
     return f"{round(int(rows[0]['steps']) / 1e6, 2):g}M"
+
+
+def usual_budget(ours: dict, methods: Sequence[str]) -> str:
+    """The number of steps that most of these methods' test rows have; others need a label."""
+    return Counter(millions(ours[m, "test"]) for m in methods).most_common(1)[0][0]
+
+
+def with_budget(text: str, ours: dict, method: str, usual: str) -> str:
+    """A method's name or score, and its number of steps where that is not the usual one."""
+    steps = millions(ours[method, "test"])
+    return text if steps == usual else f"{text}, {steps}"
 
 
 def runs_of(env: str, kind: str = "") -> list[dict]:
@@ -286,6 +298,7 @@ def bar_figure(env: str, path: Path) -> None:
     """Train and test bars per method, ours filled and published outlined."""
     ours, theirs = scores(env), published(env)
     methods = shown(env)[env]
+    usual = usual_budget(ours, methods)
     figure, axes = plt.subplots(1, 2, figsize=(11, 3.8), sharey=True)
     for axis, phase, title in zip(
         axes, ("train", "test"), ("training actions", "unseen actions"), strict=True
@@ -300,14 +313,13 @@ def bar_figure(env: str, path: Path) -> None:
         if env in ppo_actiongen.CEILINGS:
             ceiling = ppo_actiongen.CEILINGS[env][phase == "test"]
             axis.axhline(ceiling, color="grey", lw=1)
-        axis.set_xticks(range(len(methods)), [METHODS[m] for m in methods], rotation=35, ha="right")
+        names = [with_budget(METHODS[m], ours, m, usual) for m in methods]
+        axis.set_xticks(range(len(methods)), names, rotation=35, ha="right")
         axis.set_title(title)
         axis.spines[["top", "right"]].set_visible(False)
     name = TITLES.get(env, paper.TITLES.get(env, env))
-    figure.suptitle(f"{name}\n{BAR_KEY}", fontsize=9)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    figure.suptitle(f"{name}, {usual} steps where no others are named\n{BAR_KEY}", fontsize=9)
+    save(figure, path)
 
 
 def curve_figure(env: str, path: Path) -> None:
@@ -370,11 +382,10 @@ def comparison(experiment: str) -> str:
 
 def overview(experiment: str) -> str:
     """The main results: methods down, environments across, unseen actions only."""
-    found, titles = shown(experiment), []
+    found = shown(experiment)
     ours = {env: scores(env, methods) for env, methods in found.items()}
-    for env, rows_of_env in ours.items():
-        steps = Counter(millions(rows) for rows in rows_of_env.values())
-        titles.append(f"{paper.TITLES[env]}, {steps.most_common(1)[0][0]} steps")
+    usual = {env: usual_budget(ours[env], methods) for env, methods in found.items()}
+    titles = [f"{paper.TITLES[env]}, {usual[env]} steps" for env in found]
     lines = ["| method | " + " | ".join(titles) + " |"]
     lines.append("|---" * (1 + len(found)) + "|")
     for method in [m for m in METHODS if any(m in methods for methods in found.values())]:
@@ -384,10 +395,13 @@ def overview(experiment: str) -> str:
             text = "-"
             if method in methods:
                 text = spread([float(r["score"]) for r in ours[env][method, "test"]])
-            cells.append(text + (f" ({known[0]:.3f})" if known else ""))
+            text += f" ({known[0]:.3f})" if known else ""
+            if method in methods:
+                text = with_budget(text, ours[env], method, usual[env])
+            cells.append(text)
         lines.append("| " + " | ".join(cells) + " |")
     note = note_on_brackets(lines, "published (more steps, see below)")
-    return "\n".join(lines) + "\n\nUnseen actions" + note
+    return "\n".join(lines) + f"\n\nUnseen actions{note} Other numbers of steps stand by the score."
 
 
 def panel_figure(experiment: str, path: Path) -> None:
@@ -401,6 +415,7 @@ def panel_figure(experiment: str, path: Path) -> None:
     )
     for axis, (env, methods) in zip(axes.flat, found.items(), strict=False):
         ours, theirs = scores(env, methods), published(env)
+        usual = usual_budget(ours, methods)
         for x, method in enumerate(methods):
             for at, phase, alpha in ((x - 0.2, "train", 0.35), (x + 0.2, "test", 0.9)):
                 values = [float(r["score"]) for r in ours[method, phase]]
@@ -413,9 +428,9 @@ def panel_figure(experiment: str, path: Path) -> None:
             axis.axhline(ppo_actiongen.CEILINGS[env][1], color="grey", lw=1)
         middle, half = (len(methods) - 1) / 2, max(len(methods), 4) / 2 + 0.2
         axis.set_xlim(middle - half, middle + half)  # one method is a bar, not a wall
-        names = [label(m, experiment) for m in methods]
+        names = [with_budget(label(m, experiment), ours, m, usual) for m in methods]
         axis.set_xticks(range(len(methods)), names, rotation=35, ha="right", fontsize=8)
-        axis.set_title(paper.TITLES[env], fontsize=9)
+        axis.set_title(f"{paper.TITLES[env]}, {usual} steps", fontsize=9)
         axis.spines[["top", "right"]].set_visible(False)
     for axis in axes.flat[len(found) :]:
         axis.axis("off")
@@ -481,10 +496,13 @@ def adaptation_table(experiment: str) -> str:
         "| environment | zero-shot | " + " | ".join(METHODS[m] for m in paper.ADAPT) + " | seeds |",
         "|---" * (3 + len(paper.ADAPT)) + "|",
     ]
+    trained = []
     for env in paper.EXPERIMENTS[experiment].runs:
         line, curves = adaptation(env)
         if not curves:
             continue
+        tested = [r for r in read(RESULTS / "fig9.csv") if r["env"] == env]
+        tested.sort(key=lambda r: -int(r["steps"]))  # the zero-shot line is of the most steps
         cells = [paper.TITLES[env], "-" if line is None else f"{line:.3f}"]
         for method in paper.ADAPT:
             steps = [step for step, score in curves.get(method, ()) if score > (line or 0)]
@@ -496,9 +514,12 @@ def adaptation_table(experiment: str) -> str:
                 cells.append(f"not reached in {curves[method][-1][0]:,}")
         rows = [r for r in read(RESULTS / "fig9_curves.csv") if r["env"] == env]
         lines.append("| " + " | ".join([*cells, str(len({r["seed"] for r in rows}))]) + " |")
+        trained.append(f"{millions(tested)} ({paper.TITLES[env]})" if tested else "")
+    trained = list(filter(None, trained))
     return "\n".join(lines) + (
         "\n\nSteps until the training score, averaged over seeds and over a hundredth of the run, "
-        "first exceeds the zero-shot score with all test actions on offer at once."
+        "first exceeds the zero-shot score with all test actions on offer at once. Zero-shot and "
+        f"fine-tuned policies were trained for {'; '.join(trained)} steps."
         + " The Recommender's ours adapts to 2,000 of its 2,500 test products, as published."
         * ("recsys" in {r["env"] for r in read(RESULTS / "fig9_curves.csv")})
     )
@@ -559,7 +580,7 @@ def published_analysis(experiment: str, env: str, method: str) -> dict[float, tu
     """x -> published mean and std."""
     name, task = ANALYSES[experiment][2], env.removeprefix("create-")
     method = method.replace("ours_analysis", "ours")
-    rows = read(RESULTS / "published_analyses.csv")
+    rows = read(PUBLISHED / "published_analyses.csv")
     rows = [r for r in rows if (r["analysis"], r["task"], r["method"]) == (name, task, method)]
     return {float(r["x"]): (float(r["mean"]), float(r["std"])) for r in rows}
 
@@ -584,7 +605,14 @@ def analysis_table(experiment: str) -> str:
             sizes += [float(r["pool_size"]) for r in rows]
         sizes = sorted({round(min(sizes)), round(max(sizes))})
         lines.append("| " + " | ".join([*cells, " to ".join(map(str, sizes))]) + " |")
-    return "\n".join(lines) + "\n\nUnseen actions" + note_on_brackets(lines, "published")
+    policies = []  # every policy of the table, with its number of steps and of seeds
+    for (env, method), points in found.items():
+        rows = next(iter(points.values()))
+        count = f"{len(rows)} seed{'s' * (len(rows) > 1)}"
+        policies.append(f"{paper.TITLES[env]}, {METHODS[method]}: {millions(rows)} steps, {count}")
+    on_offer = "Unseen and training actions" if name == "ratio" else "Unseen actions"
+    note = note_on_brackets(lines, "published")
+    return "\n".join(lines) + f"\n\n{on_offer}{note} {'; '.join(dict.fromkeys(policies))}."
 
 
 def analysis_figure(experiment: str, path: Path) -> None:
@@ -763,6 +791,14 @@ def fill(text: str, experiment: str) -> str:
 
 def main() -> None:
     """Draw everything there are results for, and write (or check) the README's tables."""
+    global RESULTS
+    for folder in (a for a in sys.argv[1:] if not a.startswith("-")):
+        RESULTS = Path(folder)
+        if not RESULTS.is_dir():
+            raise SystemExit(f"error: no folder {folder}")
+        for experiment in paper.EXPERIMENTS:
+            draw(experiment)
+        return
     readme = ROOT / "README.md"
     text = new = readme.read_text()
     for experiment in paper.EXPERIMENTS:

@@ -146,13 +146,13 @@ def test_unknown_names_are_refused(args, word):
 def test_a_finished_run_of_another_command_is_not_collected(tmp_path):
     args = paper.Args(("gridworld",), methods=("engineered",), seeds=(0,), runs_dir=str(tmp_path))
     ((run,),) = (plan.runs for plan in paper.plan(args))
-    paper.check_finished(run, args)  # nothing there yet
+    paper.check_finished(run)  # nothing there yet
     run.folder.mkdir()
-    saved = ppo_actiongen.plain_args(paper.args_of(run, args))
+    saved = ppo_actiongen.plain_args(paper.args_of(run))
     del saved["explore"]  # made before there was such an option
     (run.folder / "args.json").write_text(json.dumps(saved))
     (run.folder / "results.json").write_text("{}")
-    paper.check_finished(run, args)
+    paper.check_finished(run)
     other = paper.Args(**vars(args) | {"extra": "--ent-coef 0.9"})
     ((same_folder,),) = (plan.runs for plan in paper.plan(other))
     assert same_folder.folder == run.folder
@@ -213,6 +213,17 @@ def test_a_finished_adaptation_has_one_phase_and_a_curve(tmp_path):
     paper.collect_run(run, tmp_path)
     (row,) = csv.DictReader((tmp_path / "gridworld.csv").open())
     assert row["command"] == run.command != rows[0]["command"]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "results").glob("*.csv")), ids=lambda p: p.stem)
+def test_no_result_is_counted_twice(path):
+    rows = list(csv.DictReader(path.open()))
+    if "command" not in rows[0] or "seed" not in rows[0]:
+        return  # curves, published numbers, places of a t-SNE picture
+    same = "env method seed steps phase".split()
+    same += [name for name in paper.OPTIONS if name != "episodes"]
+    keys = [tuple(row.get(name) for name in same) for row in rows]
+    assert len(set(keys)) == len(keys)
 
 
 # ---- the report ----
