@@ -385,6 +385,12 @@ class Args:
     """Where the tables go (default: results; of other recipes, results-<recipes>: their rows are
     not further seeds of the same thing)."""
 
+    @property
+    def results(self) -> Path:
+        """The folder that `results_dir` says or leaves open."""
+        recipes = self.recipe.replace("fast", ""), self.hvae_recipe.replace("laptop", "")
+        return Path(self.results_dir or "-".join(["results", *filter(None, recipes)]))
+
 
 # ---- from experiments to commands ----
 
@@ -778,7 +784,7 @@ def collect_panel(figure: str, panel: str, encoder: Encoder | None, args: Args) 
     if not encoder:  # the published scores are of an encoder's table
         rows = [row | {"published": None} for row in rows]
     held_out, labels = hvae.held_out_labels(options)
-    results_dir = Path(args.results_dir)
+    results_dir = args.results
     merge(results_dir / "encoders.csv", ENCODER_COLUMNS, rows, ("figure", "panel"))
     places = hvae.tsne(mean[held_out])  # (n, D) -> (n, 2)
     points = [
@@ -826,7 +832,7 @@ def train_policy(run: Run, args: Args, lock: Lock) -> bool:
         call("ppo_actiongen.py", [*run.words, *flags, "--no-tensorboard"], log)
     with lock:
         if run.finished:
-            collect_run(run, Path(args.results_dir))
+            collect_run(run, args.results)
         phase = "train" if run.method in ADAPT else "test"
         results = run.folder / "results.json"
         return finish(run, log, lambda: json.loads(results.read_text())[phase]["score"])
@@ -841,7 +847,7 @@ def test_policy(tests: list[Test], args: Args, lock: Lock) -> list[bool]:
             call("ppo_actiongen.py", [*test.words], log)
         with lock:
             if test.finished:
-                collect_test(test, Path(args.results_dir))
+                collect_test(test, args.results)
             done.append(finish(test, log, lambda t=test: float(t.row()["score"])))
     return done
 
@@ -892,9 +898,6 @@ def show(plans: list[Plan]) -> None:
 def main() -> None:
     """Print or run the commands."""
     args = tyro.cli(Args)
-    if args.results_dir is None:
-        recipes = args.recipe.replace("fast", ""), args.hvae_recipe.replace("laptop", "")
-        args.results_dir = "-".join(["results", *filter(None, recipes)])
     try:
         plans = plan(args)
         if args.dry_run:

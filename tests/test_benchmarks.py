@@ -160,6 +160,38 @@ def test_a_finished_run_of_another_command_is_not_collected(tmp_path):
         paper.run_all(paper.plan(other), other)
 
 
+def test_the_papers_recipe_has_its_own_methods_widths_and_results():
+    args = paper.Args(("gridworld",), recipe="paper", seeds=(0,))
+    (plan,) = paper.plan(args)
+    assert {run.method for run in plan.runs} == set(paper.RUNS["gridworld"]) - paper.BEYOND - set(
+        paper.ADAPT
+    )
+    for run in plan.runs:
+        run_args = paper.args_of(run)
+        assert (run_args.hidden_size, run_args.utility_hidden, run_args.recipe) == (
+            64,
+            None,
+            "paper",
+        )
+    assert (args.results, paper.Args(("gridworld",)).results) == (
+        Path("results-paper"),
+        Path("results"),
+    )
+    assert paper.Args(("fig4",), hvae_recipe="quick", results_dir="x").results == Path("x")
+    with pytest.raises(ValueError, match="is about the fast recipe"):
+        paper.plan(paper.Args(("create-recipe",), recipe="paper"))
+
+
+def test_hours_hold_evaluations_and_the_encoders_recipe():
+    args = paper.Args(("gridworld",), methods=("ours",), seeds=(0,))
+    (plan,) = paper.plan(args)
+    (run,), (encoder,) = plan.runs, plan.encoders
+    assert run.hours > run.steps / run.rate / 3600
+    args.hvae_recipe = "paper"
+    ((days,),) = (plan.encoders for plan in paper.plan(args))
+    assert days.hours > 24 > 1 > encoder.hours
+
+
 def test_merging_replaces_rows_of_the_same_key_and_keeps_the_rest(tmp_path):
     path, columns = tmp_path / "t.csv", ["method", "seed", "score"]
     first = [dict(method="a", seed=s, score=0.5) for s in (0, 1)]
@@ -213,6 +245,19 @@ def test_a_finished_adaptation_has_one_phase_and_a_curve(tmp_path):
     paper.collect_run(run, tmp_path)
     (row,) = csv.DictReader((tmp_path / "gridworld.csv").open())
     assert row["command"] == run.command != rows[0]["command"]
+
+
+def test_pictures_of_another_folder_leave_the_readme_alone(tmp_path, monkeypatch):
+    text = (ROOT / "README.md").read_text()
+    same = dict(env="gridworld", method="ours", seed=0, steps=9, hours=1, score=0.5)
+    write(tmp_path / "gridworld.csv", [same | {"phase": p} for p in ("train", "valid", "test")])
+    monkeypatch.setattr(sys, "argv", ["report.py", str(tmp_path)])
+    monkeypatch.setattr(report, "RESULTS", report.RESULTS)  # main changes it
+    report.main()
+    assert (tmp_path / "gridworld.png").exists() and text == (ROOT / "README.md").read_text()
+    monkeypatch.setattr(sys, "argv", ["report.py", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit, match="nowhere"):
+        report.main()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "results").glob("*.csv")), ids=lambda p: p.stem)
