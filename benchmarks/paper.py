@@ -339,7 +339,7 @@ COLUMNS = (
     "published hours command"
 ).split()
 CURVE_COLUMNS = "env task method seed step train_score valid_score".split()
-ADAPT_COLUMNS = "env task method seed step episode_score".split()
+ADAPT_COLUMNS = "env task method seed steps step episode_score".split()
 OPTIONS = (  # what an evaluation is known by
     "actions num_available min_angle_gap min_embedding_distance unseen_ratio greedy episodes"
 ).split()
@@ -706,7 +706,8 @@ def adaptation_of(run: Run, points: int = 100) -> list[dict]:
         scores = [float(row["episode_score"]) for row in part if row["episode_score"]]
         if scores:  # no episode may have ended in so short a time
             rows.append({"step": part[-1]["step"], "episode_score": float(np.mean(scores))})
-    return [identity(run) | row for row in rows]
+    steps = json.loads((run.folder / "results.json").read_text())["steps"]
+    return [identity(run) | {"steps": steps} | row for row in rows]
 
 
 def merge(path: Path, columns: list[str], rows: list[dict], key: tuple[str, ...]) -> None:
@@ -746,7 +747,7 @@ def collect_run(run: Run, results_dir: Path) -> None:
     key = ("env", "method", "seed", "steps")
     merge(results_dir / f"{file_of(run.env)}.csv", COLUMNS, scores, key)
     if run.method in ADAPT:
-        merge(results_dir / "fig9_curves.csv", ADAPT_COLUMNS, adaptation_of(run), key[:3])
+        merge(results_dir / "fig9_curves.csv", ADAPT_COLUMNS, adaptation_of(run), key)
         return
     path, last = results_dir / f"{file_of(run.env)}_curves.csv", int(curve[-1]["step"])
     old = csv.DictReader(path.open()) if path.exists() else ()

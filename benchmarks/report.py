@@ -13,7 +13,7 @@ import colorsys
 import csv
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import mean, pstdev
 
@@ -471,15 +471,23 @@ def all_curves(experiment: str, path: Path) -> None:
     save(figure, path)
 
 
+def one_budget(rows: Iterable[dict]) -> list[dict]:
+    """Of these rows those of one number of steps: of most seeds, then the largest."""
+    seeds = defaultdict(set)
+    for r in (rows := list(rows)):
+        seeds[int(r["steps"])].add(r["seed"])
+    best = max(seeds, key=lambda steps: (len(seeds[steps]), steps), default=0)
+    return [r for r in rows if int(r["steps"]) == best]
+
+
 def adaptation(env: str) -> tuple[float | None, dict[str, list[tuple[int, float]]]]:
     """Figure 9: the zero-shot score, and per variant the seed-averaged curve while it adapts."""
-    zero_shot = [r for r in read(RESULTS / "fig9.csv") if r["env"] == env]
-    most = max((int(r["steps"]) for r in zero_shot), default=0)  # the best trained policies
-    zero_shot = [float(r["score"]) for r in zero_shot if int(r["steps"]) == most]
+    zero_shot = one_budget(r for r in read(RESULTS / "fig9.csv") if r["env"] == env)
+    zero_shot = [float(r["score"]) for r in zero_shot]
+    rows_of_env = [r for r in read(RESULTS / "fig9_curves.csv") if r["env"] == env]
     curves = {}
     for method in paper.ADAPT:
-        rows = [r for r in read(RESULTS / "fig9_curves.csv") if r["env"] == env]
-        rows = [r for r in rows if r["method"] == method]
+        rows = one_budget(r for r in rows_of_env if r["method"] == method)
         points = defaultdict(list)
         for r in rows:
             points[int(r["step"])].append(float(r["episode_score"]))
@@ -501,8 +509,7 @@ def adaptation_table(experiment: str) -> str:
         line, curves = adaptation(env)
         if not curves:
             continue
-        tested = [r for r in read(RESULTS / "fig9.csv") if r["env"] == env]
-        tested.sort(key=lambda r: -int(r["steps"]))  # the zero-shot line is of the most steps
+        tested = one_budget(r for r in read(RESULTS / "fig9.csv") if r["env"] == env)
         cells = [paper.TITLES[env], "-" if line is None else f"{line:.3f}"]
         for method in paper.ADAPT:
             steps = [step for step, score in curves.get(method, ()) if score > (line or 0)]

@@ -336,8 +336,9 @@ def adaptation_rows(tmp_path, scores):
         tmp_path / "fig9_curves.csv",
         [
             same
-            | dict(method="ours_from_scratch", seed=s, step=(i + 1) * 10**6, episode_score=v + d)
-            for s, d in ((0, 0.1), (1, -0.1))
+            | dict(method="ours_from_scratch", seed=s, steps=n)
+            | dict(step=(i + 1) * 10**6, episode_score=v + d)
+            for n, s, d in ((3, 0, 0.1), (3, 1, -0.1), (9, 0, 0.5))  # the last one: another budget
             for i, v in enumerate(scores)
         ],
     )
