@@ -519,6 +519,7 @@ class FactorisedUtility(torch.autograd.Function):
         G_u = torch.empty_like(u)
 
         def piece(rows, G_P):
+            """Write these rows of G_u, and add their part to G_P."""
             g, sets = grad[rows], available[rows]  # 2 x (b, K)
             whole = sets.shape[1] >= len(P)
             if whole:  # into the table's order
