@@ -663,7 +663,8 @@ class Agent(nn.Module):
         """The utility's hidden layer for one action each, read out: (B, H), (B,) -> (B, 2)."""
         H = self.action_project.out_features
         u = code @ self.utility_hidden.weight[:, :H].T  # (B, W)
-        return self.outcome(F.relu(u + P[taken]))  # (B, W) + (B, W) -> (B, 2)
+        # The gradient of P[taken] would add rows in whatever order the threads come to them.
+        return self.outcome(F.relu(u + P.index_select(0, taken)))  # 2 x (B, W) -> (B, 2)
 
     def mixture(self, logp):
         """log of (1 - explore) pi + explore / K, the policy while learning: (B, K) -> (B, K).

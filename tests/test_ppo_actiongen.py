@@ -591,6 +591,16 @@ def test_one_seed_gives_one_run(finished, tmp_path):
     assert a == b
 
 
+def test_one_seed_gives_one_run_with_two_threads(tmp_path):
+    # Minibatches of the real size: smaller ones are not divided among threads by PyTorch, and so
+    # cannot show gradients that are added in the order in which the threads happen to come.
+    folders = [tmp_path / name / "gridworld-engineered-s0" for name in "ab"]
+    for folder in folders:
+        words = command(folder.parent, "--threads", "2", "--minibatch-size", "1024", steps=4096)
+        assert run(words).returncode == 0
+    assert timeless(folders[0]) == timeless(folders[1]) and same_weights(*folders)
+
+
 @pytest.mark.parametrize("moment", [0.3, 0.8])
 def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path, moment):
     folder, _ = finished
