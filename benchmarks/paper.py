@@ -225,9 +225,10 @@ EXPERIMENTS |= {
     "fig4": Experiment(
         "Figure 4: representations of unseen skills, Grid World",
         encoders={
-            "(x, y) trajectories": "gridworld --recipe mlp",
-            "VAE": "gridworld --recipe mlp --no-hierarchical",
+            "(x, y) trajectories": "gridworld --recipe lstm",  # the three of the policies' tables
+            "VAE": "gridworld --recipe lstm --no-hierarchical",
             "one-hot": "gridworld --modality onehot",
+            "MLP encoder": "gridworld --recipe mlp",  # beyond the paper
             "linear path": "gridworld",  # beyond the paper, the default
             "engineered": "gridworld engineered",
         },
