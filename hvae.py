@@ -103,7 +103,7 @@ class Args:
     observations: int | None = None  # Table 4: recorded of each action: 1,024
     batch_observations: int | None = None  # of each action in one update (paper: all)
     table_observations: int | None = None  # of each action for its representation (paper: all)
-    set_size: int | None = None  # observations that share KL(q(c|X)); None: those of an update
+    set_size: int | None = None  # observations that share KL(q(c|X)); paper: those of an update
     q_hidden: int | None = None  # Table 4: width of q(c|X): 128
     hidden: int | None = None  # Table 4: default width: 64 (published code: pictures, video 128)
     encoder: Literal["lstm", "mlp"] | None = None  # of trajectories: D.3.1's, or beyond the paper
@@ -111,10 +111,9 @@ class Args:
     relative: bool | None = None  # states relative to the first one, instead of raw
     compact: bool | None = None  # Bi-LSTM with half the width per direction, concatenated
     log_var_lr: float | None = None  # free log-variances: multiple of the learning rate
-    decoder_log_var: float | None = None  # its start; None: from N(0, 1) (published code)
-    kl_warmup: float | None = (
-        None  # share of the updates in which the weight of the KLs climbs to 1
-    )
+    decoder_log_var: float | None = None  # the decoder's at the start; paper: from N(0, 1)
+    # share of the updates in which the weight of the KLs climbs to 1
+    kl_warmup: float | None = None
     workers: int = 0  # processes that record observations, 0: one per core; same result
     threads: int = 1  # CPU threads of torch; a second one waits more than it works
     plots: bool = True  # draw the t-SNE and reconstruction pictures
@@ -132,7 +131,7 @@ TABLE_4 = dict(learning_rate=1e-3, observations=1024, q_hidden=128, hidden=64)
 VISUAL = dict(batch_size=32, epochs=5_000, hidden=128)  # published code, for CREATE video too
 
 # Every way in which the short recipes leave the paper. Each line stands alone: what it is worth can
-# be seen by switching it back on the command line.
+# be seen by switching it back on the command line (only decoder_log_var has no such word).
 RECIPES = {
     "paper": dict(  # 128 x 1,024 trajectories in one update take 11 GB of memory
         batch_observations=1024,
@@ -230,7 +229,8 @@ def load_environment(env: str) -> ModuleType:
 def resolve(args: Args) -> Args:
     """A copy of `args` with every None filled in from the tables and the recipe.
 
-    Raises ValueError for an unknown environment, modality or other choice, or a count below 1.
+    Raises ValueError for an unknown environment, modality or other choice, a number out of range,
+    and an option without effect. Call it once, on what the user gave.
     """
     module = load_environment(args.env)
     if not module.MODALITIES:
@@ -253,6 +253,8 @@ def resolve(args: Args) -> Args:
         preset |= SPECIAL.get(special, {})
     if preset.get("linear_path") and not args.hierarchical:  # no c, no path to it: learn longer
         preset |= dict(linear_path=False, updates=RECIPES["mlp"]["updates"])
+    if args.epochs and args.updates and args.epochs != preset["epochs"]:
+        raise ValueError("epochs and updates: give one of them")
     if args.epochs and not args.updates:
         preset.pop("updates", None)  # asked for in epochs: the recipe's number steps back
     given = {key: value for key, value in asdict(args).items() if value is not None}
@@ -260,9 +262,30 @@ def resolve(args: Args) -> Args:
     for name in COUNTS:
         if (value := getattr(args, name)) is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+    for name in ("seed", "split_seed", "workers"):
+        if not 0 <= getattr(args, name) < 2**63:
+            raise ValueError(f"{name} must be 0 or more, got {getattr(args, name)}")
+    if not 0 <= args.kl_warmup <= 1:
+        raise ValueError(f"kl_warmup must be between 0 and 1, got {args.kl_warmup}")
+    for name in ("learning_rate", "log_var_lr"):
+        if not 0 < getattr(args, name) < np.inf:
+            raise ValueError(f"{name} must be a positive number, got {getattr(args, name)}")
+    picture, flat = KINDS[modality] == "image", KINDS[modality] in ("image", "video")
+    for name, unused in dict(
+        q_hidden=not args.hierarchical,
+        set_size=not args.hierarchical,
+        decoder_log_var=KINDS[modality] == "onehot",
+        encoder=picture,
+        compact=picture or args.encoder == "mlp",
+        relative=flat,
+    ).items():  # an ablation that changes nothing would pass for a result
+        if unused and name in given:
+            model = f"{'HVAE' if args.hierarchical else 'plain VAE'}, encoder {args.encoder}"
+            raise ValueError(f"{name} has no effect here: modality {modality}, {model}")
     if args.linear_path and not args.hierarchical:
         raise ValueError("linear_path: the plain VAE has no c that a path could lead to")
-    if args.compact and args.encoder == "lstm" and args.hidden % 2:
+    lstm = args.encoder == "lstm" and KINDS[modality] != "image"
+    if args.compact and lstm and args.hidden % 2:
         raise ValueError(f"hidden {args.hidden}: the Bi-LSTM has two halves, so it must be even")
     if args.linear_path and KINDS[modality] in ("image", "video"):
         raise ValueError(
@@ -487,9 +510,14 @@ class ObservationEncoder(nn.Module):
         self.numbers = fmt.length * features if args.linear_path else 0
         self.size = hidden + self.numbers  # H
 
+    def frames(self, x: torch.Tensor) -> torch.Tensor:
+        """Pictures (B, L, 1, S, S) -> their features (B, L, 288); states stay as they are."""
+        return x if self.conv is None else self.conv(x.flatten(0, 1)).unflatten(0, x.shape[:2])
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self.conv is not None:
-            x = self.conv(x.flatten(0, 1)).unflatten(0, x.shape[:2])  # (B, L, 288)
+        return self.summary(self.frames(x))
+
+    def summary(self, x: torch.Tensor) -> torch.Tensor:
         h = self.sequence(x)
         return torch.cat([h, x.flatten(1)], 1) if self.numbers else h  # (B, H)
 
@@ -675,8 +703,9 @@ class ObservationModel(nn.Module):
         """Raw observations (A, n, ...) -> means per observation: {"loss", "rec", "kl_z", "kl_c",
         "error"}; error is the squared error, or the share of wrong classes."""
         inputs, start, target = prepare(raw.flatten(0, 1), self.format)  # (B, ...)
-        latents, kl_z, kl_c = self.infer(self.encoder(inputs), raw.shape[1], sample)
-        output = self.decode(start, *latents)
+        frames = self.encoder.frames(inputs)
+        latents, kl_z, kl_c = self.infer(self.encoder.summary(frames), raw.shape[1], sample)
+        output = self.decode(start, *latents, first=frames[:, 0])
         rec = self.log_likelihood(target, output).mean()
         # One c serves the whole set, so each of its observations bears a part of the price of c.
         kl_z, kl_c = kl_z.mean(), kl_c.mean() / self.set_size
@@ -695,10 +724,11 @@ class ObservationModel(nn.Module):
             log_prob = gaussian_log_prob(target, output, self.log_var.clamp(*LOG_VAR_RANGE))
         return log_prob.flatten(1).sum(1)
 
-    def decode(self, start: torch.Tensor, *latents: torch.Tensor) -> torch.Tensor:
+    def decode(self, start, *latents, first=None) -> torch.Tensor:
         """Latents and first states -> means in the shape of targets, or logits (B, T, 2, 80)."""
         if self.format.kind == "video":  # the first frame enters as its convolutional features
-            features = self.decoder(self.encoder.conv(start), *latents)  # (B, T, 288)
+            first = self.encoder.conv(start) if first is None else first  # (B, 288)
+            features = self.decoder(first, *latents)  # (B, T, 288)
         else:
             features = self.decoder(start, *latents)  # (B, T, F), or (B, 1, 288) for a picture
         if self.format.kind == "trajectory":
@@ -886,6 +916,13 @@ def train(args: Args) -> Path:
         raise ValueError(
             f"device {device!r} is not available; allowed: auto, cpu, cuda (with a GPU)"
         )
+    try:  # now, not after the training: can files with the longest of the names be written?
+        path.parent.mkdir(parents=True, exist_ok=True)
+        longest = path.with_name(f".{os.getpid()}-{path.stem}-reconstructions.png")
+        longest.touch()
+        longest.unlink()
+    except OSError as e:
+        raise ValueError(f"cannot write to {path.parent}: {e.strerror}") from None
     threads = torch.get_num_threads()
     torch.set_num_threads(args.threads)
     keep_memory()
@@ -901,7 +938,12 @@ def train(args: Args) -> Path:
         torch.set_num_threads(threads)
     write_atomically(path.with_suffix(".csv"), lambda file: write_csv(file, rows))
     weights = {name: value.cpu() for name, value in model.state_dict().items()}
-    write_atomically(path.with_suffix(".pt"), lambda file: torch.save(weights, file))
+
+    def save(temporary: Path) -> None:
+        with open(temporary, "wb") as file:  # an open file: torch.save would note a path's name
+            torch.save(weights, file)
+
+    write_atomically(path.with_suffix(".pt"), save)
     report(model, module, mean, path, args)
     return save_representation(path, args.env, mean, log_var, ids, settings(args))
 
@@ -954,7 +996,11 @@ def representation_path(args: Args) -> Path:
     full = resolve(args)
     choices = {k: v for k, v in settings(args).items() if v is not None and k in OVERRIDES}
     recipe = settings(resolve(replace(args, **dict.fromkeys(OVERRIDES))))
-    changed = [f"{k}={v}" for k, v in choices.items() if getattr(full, k) != recipe[k]]
+    # Epochs count only where there is no number of updates: named then, even if they are Table 3's.
+    counts = {"epochs"} if full.updates is None and recipe["updates"] is not None else set()
+    changed = [
+        f"{k}={v}" for k, v in choices.items() if getattr(full, k) != recipe[k] or k in counts
+    ]
     parts = [args.env, full.modality, "hvae" if args.hierarchical else "vae"]
     parts += ["all"] * (args.train_on == "all")
     parts += [f"{args.split}{args.split_seed or ''}", args.recipe, *changed, f"s{args.seed}"]
@@ -1033,6 +1079,10 @@ def load_representation(
         raise ValueError(f"{path} is not a file of representations: {reason}") from None
     if config.get("environment") != env:
         raise ValueError(f"{path} belongs to {config.get('environment')!r}, not to {env!r}")
+    for key in ("mean", "log_var"):  # first: a float64 may be finite and a float32 not
+        if table[key].dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                table[key] = table[key].astype(np.float32)
     check_table(table, module.NUM_ACTIONS, str(path))
     if config.get("fingerprint") != fingerprint(module):
         raise ValueError(f"{path} belongs to another action set of {env}: train it again")
@@ -1223,7 +1273,8 @@ def report(model, module, mean: np.ndarray, path: Path, args: Args) -> None:
     for row in rows:
         numbers = f"{row['value']:7.3f}  {row['engineered']:10.3f}"
         print(f"  {row['score']:14} {numbers}  {row['published'] or '-'}")
-    scores = {row["score"]: row["value"] for row in rows}
+    # JSON knows no NaN: null where no held-out action has the feature
+    scores = {row["score"]: None if np.isnan(row["value"]) else row["value"] for row in rows}
     published = {row["score"]: row["published"] for row in rows if row["published"] != ""}
     record = json.dumps(dict(scores=scores, published=published))
     write_atomically(path.with_suffix(".json"), lambda file: file.write_text(record + "\n"))
@@ -1312,7 +1363,7 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     try:
         print(f"representations: {train(args)}")
-    except (ValueError, FileNotFoundError) as e:
+    except (ValueError, OSError, MemoryError) as e:
         raise SystemExit(f"error: {e}") from None
 
 

@@ -182,6 +182,14 @@ def test_shut_mask_shows_the_first_frame_and_open_mask_the_picture():
     torch.testing.assert_close(opened, torch.full_like(opened, 0.5))
 
 
+def test_video_looks_at_every_frame_once():
+    model, raw = small("video")
+    model.train()
+    model(raw)
+    counts = [v for k, v in model.state_dict().items() if k.endswith("num_batches_tracked")]
+    assert len(counts) > 5 and all(count == 1 for count in counts)
+
+
 @pytest.mark.parametrize("model", [HVAE, VAE])
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_gradient_reaches_every_parameter(kind, model):
@@ -355,8 +363,10 @@ def test_same_seed_same_bytes_and_the_callers_generators_are_left_alone(tmp_path
     for run, seed in (("a", 0), ("b", 0), ("c", 1)):
         args = Args(updates=6, seed=seed, runs_dir=str(tmp_path / run), threads=1, plots=False)
         args.observations = 64
-        files[run] = hvae.train(args).read_bytes()
-    assert files["a"] == files["b"] != files["c"]
+        path = hvae.train(args)
+        files[run] = [path.with_suffix(end).read_bytes() for end in (".npz", ".pt", ".json")]
+    assert files["a"] == files["b"]
+    assert all(a != c for a, c in zip(files["a"], files["c"], strict=True))
     assert torch.equal(before, torch.get_rng_state())
     assert np.array_equal(numpy_before, np.random.get_state()[1])  # noqa: NPY002
 
@@ -385,6 +395,16 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
     (dict(updates=0), "updates must be at least 1, got 0"),
     (dict(batch_size=-1), "batch_size must be at least 1, got -1"),
     (dict(encoder="lstm", hidden=63), "hidden 63: .* must be even"),
+    (dict(kl_warmup=-0.2), "kl_warmup must be between 0 and 1, got -0.2"),
+    (dict(log_var_lr=-10.0), "log_var_lr must be a positive number, got -10.0"),
+    (dict(learning_rate=np.nan), "learning_rate must be a positive number, got nan"),
+    (dict(seed=-1), "seed must be 0 or more, got -1"),
+    (dict(epochs=2, updates=3), "epochs and updates: give one"),
+    (dict(hierarchical=False, q_hidden=7), "q_hidden has no effect here: .* plain VAE"),
+    (dict(modality="onehot", decoder_log_var=-1.0), "decoder_log_var has no effect here"),
+    (dict(env="stacking", encoder="mlp"), "encoder has no effect here: modality image"),
+    (dict(compact=False), "compact has no effect here: .* encoder mlp"),
+    (dict(runs_dir="/dev/null/runs"), "cannot write to /dev/null/runs/hvae: Not a directory"),
 ])  # fmt: skip
 def test_bad_choices_are_refused_before_anything_is_written(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words) as error:
@@ -402,6 +422,10 @@ def test_only_the_recipes_own_table_has_its_name():
     changes += [dict(learning_rate=0.5), dict(representation_size=4), dict(recipe="lstm")]
     assert len({name(**change) for change in changes}) == len(changes)
     assert name(updates=1) == "gridworld-xy-hvae-default-laptop-updates=1-s0.npz"
+    table_3 = (
+        "gridworld-xy-hvae-default-laptop-epochs=10000-s0.npz"  # 40 times the recipe's updates
+    )
+    assert name(epochs=10_000) == table_3
 
 
 def test_plain_vae_without_a_linear_path_learns_longer():
@@ -583,6 +607,7 @@ def rewrite(source, target, **changes):
     (dict(mean=np.zeros((9, 16), np.float32)), r"\(1024, D\)"),
     (dict(mean=np.zeros((1024, 16), int)), "floating-point"),
     (dict(log_var=np.full((1024, 16), np.inf)), "finite"),
+    (dict(mean=np.full((1024, 16), 1e300)), "finite"),  # too large for float32
     (dict(action_ids=np.zeros(3)), "distinct integers"),
     (dict(action_ids=TRAIN[:-1]), "other actions than split"),
 ])  # fmt: skip
