@@ -74,7 +74,7 @@ HIT_DISTANCE = 0.03  # published code: target counts as hit after this share of 
 BALL_RADIUS, BALL_MASS = 4.0, 10.0  # published code: target, marker, goal and probe ball
 PLANK_MASS, PLANK_MOMENT = 10.0, 10_000.0  # published code: levers and see-saws, very sluggish
 LADDER_ANGLE = 95.0  # published code, degrees
-BELT_LIFT = 4.0  # published code: a ladder moves a ball sideways this many times faster than up
+BELT_LIFT = 4.0  # published code: a ladder multiplies the sideways part of its motion by this
 
 FRAMES_PER_ACTION = 5  # ours: pictures per action in GIFs; divides 40
 
@@ -172,7 +172,7 @@ SOFT, BOUNCY = (0.1, 0.3, 0.5), (0.8, 1.0, 1.2)  # published code: the two elast
 SOFT_FINE, BOUNCY_FINE = (0.1, 0.2, 0.3, 0.4, 0.5), (0.8, 0.9, 1.0, 1.1, 1.2)
 # A full turn of a class: the angle after which the shape repeats. Angles run over [0, turn) in
 # steps of 15 degrees, which is the appendix's "no two tools are within 15 degrees difference of
-# each other".
+# each other" (but for pentagons: 60 degrees is 12 from the next 0).
 TURN = {"Ramp": 180, "Trampoline": 180, "Cannon": 360, "Fan": 360, "Funnel": 360, "Bucket": 360}
 for _sides, _name in ((3, "Triangle"), (4, "Square"), (5, "Pentagon"), (6, "Hexagon")):
     TURN[_name] = TURN[f"Bouncy {_name}"] = 360 // _sides
@@ -444,17 +444,6 @@ TASKS: dict[str, Task] = {
         goal=_star(-0.7, -0.64, "goal"),
         shifts={"marker": _even(0.2), "target": _even(0.2), "goal": _even(0.2)},
     ),
-    "navigate": Task(
-        items=(
-            _ball("Marker", -0.6, 0.75),
-            _line(0.1, -0.35, 16, shift="target"),
-            _line(-0.65, -0.7, 16, shift="goal"),
-            _line(-0.5, 0.1, 40),
-        ),
-        target=_ball("Target", 0.1, -0.24, "target"),
-        goal=_star(-0.65, -0.59, "goal"),
-        shifts={"target": _even(0.1), "goal": _even(0.2)},
-    ),
     "obstacle": Task(
         items=(
             _ball("Marker", -0.8, 0.8, "marker"),
@@ -482,7 +471,6 @@ TASKS: dict[str, Task] = {
         target_hit_reward=2.0,  # appendix: 1; published task file: 2
         max_actions=50,  # appendix: 30; published task file: 50
     ),
-    # the other nine, Figure 8
     "seesaw": Task(
         items=(
             _ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
@@ -499,6 +487,18 @@ TASKS: dict[str, Task] = {
         shifts={"ball": _even(0.05), "target": _even(0.1)},
         subgoals=((-0.1, -0.45),),
         boundary="RLC",
+    ),
+    # the other nine, Figure 8
+    "navigate": Task(
+        items=(
+            _ball("Marker", -0.6, 0.75),
+            _line(0.1, -0.35, 16, shift="target"),
+            _line(-0.65, -0.7, 16, shift="goal"),
+            _line(-0.5, 0.1, 40),
+        ),
+        target=_ball("Target", 0.1, -0.24, "target"),
+        goal=_star(-0.65, -0.59, "goal"),
+        shifts={"target": _even(0.1), "goal": _even(0.2)},
     ),
     "belt": Task(
         items=(
@@ -1086,8 +1086,8 @@ class CreateEnv(gymnasium.Env):
             raise ValueError(f"unknown render_mode {render_mode!r}; allowed: None, 'rgb_array'")
         if not (math.isfinite(tool_cost) and tool_cost >= 0):
             raise ValueError(f"tool_cost must be 0 or more, got {tool_cost}")
-        if render_size < 84:
-            raise ValueError(f"render_size must be 84 or more, got {render_size}")
+        if not isinstance(render_size, int | np.integer) or render_size < 84:
+            raise ValueError(f"render_size must be a whole number, 84 or more, got {render_size}")
         self._tools_on_offer = check_pool(action_pool, num_available)
         self._draws = num_available < len(self._tools_on_offer) + 1  # else a fixed, sorted set
         self.task, self.render_mode, self.render_size = TASKS[task], render_mode, render_size
@@ -1119,6 +1119,7 @@ class CreateEnv(gymnasium.Env):
         self._over = False
         self._trails = [(ball, []) for ball in (self._target, self._marker) if ball is not None]
         self._last = (TOOLS[NO_OP], (0.0, 0.0), Placement.NO_OP)
+        self._collected: list[Thing] = []  # subgoals of the last step, for its pictures
         self._page = None
         self._snapshots = [self._poses()]
         self._frames = np.zeros((NUM_FRAMES, 84, 84), np.uint8)
@@ -1249,6 +1250,7 @@ class CreateEnv(gymnasium.Env):
             self._goal_hit = True
         # published code: a subgoal counts if touched at the end of an action; we: at any time in it
         reached = [subgoal for subgoal in self._subgoals if subgoal.touched]
+        self._collected = reached
         for subgoal in reached:
             self._space.remove(*subgoal.parts)
             self._things.remove(subgoal)
@@ -1328,9 +1330,14 @@ class CreateEnv(gymnasium.Env):
         return self.render_frames()[-1] if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step, one every 8 physics steps: 5, or 1 right after a reset."""
+        """Pictures of the last step, one every 8 physics steps: 5, or 1 right after a reset.
+
+        None at all without render_mode.
+        """
         if self.render_mode is None:
-            raise ValueError("render_frames needs CreateEnv(render_mode='rgb_array')")
+            return []
+        if not hasattr(self, "_things"):
+            raise gymnasium.error.ResetNeeded("call reset() before the first render_frames()")
         still = [thing for thing in self._things if thing.body is None]
         if self._page is None or self._page[0] != still:  # cached until something is placed
             pen = blank_page(self.render_size)
@@ -1345,6 +1352,8 @@ class CreateEnv(gymnasium.Env):
         pen = Pen(self.render_size, self._page[1].copy())
         for ball, trail in self._trails:
             draw_trail(pen, trail[: len(trail) + age], ball.kind.colour)
+        for thing in self._collected if age < 0 else ():  # there until the action ends
+            draw_thing(pen, thing)
         for thing, pose in poses:
             thing.shown = pose
             draw_thing(pen, thing)
@@ -1406,10 +1415,12 @@ def make_vec(
     return vector(thunks, autoreset_mode=AutoresetMode.SAME_STEP)
 
 
-gymnasium.register("ActionGen/Create-v0", entry_point=CreateEnv)
+gymnasium.register("ActionGen/Create-v0", entry_point=f"{__name__}:CreateEnv")
 for _task in TASKS:  # ActionGen/Create-Push-v0 and so on
     gymnasium.register(
-        f"ActionGen/Create-{_task.capitalize()}-v0", entry_point=CreateEnv, kwargs={"task": _task}
+        f"ActionGen/Create-{_task.capitalize()}-v0",
+        entry_point=f"{__name__}:CreateEnv",
+        kwargs={"task": _task},
     )
 
 
@@ -2000,7 +2011,7 @@ def tools_sheet(size: int = 300) -> Image.Image:
 def probe_sheet(name: str, size: int = 420, trajectories: int = 40) -> Image.Image:
     """Probe-ball trajectories over one tool, moved so that the tool stands in the middle."""
     labels = action_labels()
-    if name.isdigit() and int(name) < NUM_ACTIONS:
+    if name.isdecimal() and int(name) < NUM_ACTIONS:
         ids = [int(name)]
     else:
         members = np.flatnonzero(np.char.lower(labels[:_NUM_BASE]) == name.lower())

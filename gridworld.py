@@ -168,7 +168,7 @@ def action_labels() -> np.ndarray:
     """Quadrant each skill moves the agent to (colours of Fig. 4): str (1024,), 256 of each kind.
 
     Five is odd, so no skill ends where it began; the half axes belong to the quadrant that follows
-    clockwise from them (published code).
+    counter-clockwise from them, due east to "upper right" (published code).
     """
     east, south = MOVE_DELTAS[SKILL_MOVES].sum(1).T  # (1024,) each
     quadrants = {
@@ -402,7 +402,14 @@ class GridWorldEnv(gym.Env):
         return draw_frame(self._layout, self.trace, self._skill, self._moves)
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step, one per move (after reset: one picture of the start)."""
+        """Pictures of the last step, one per move (after reset: one picture of the start).
+
+        None at all without render_mode.
+        """
+        if self.render_mode is None:
+            return []
+        if not hasattr(self, "_layout"):
+            raise gym.error.ResetNeeded("call reset() before the first render_frames()")
         first = 0 if self._skill is None else 1
         before = self._moves - (len(self.trace) - 1)  # moves made before this step
         return [

@@ -57,7 +57,7 @@ NUM_AVAILABLE = 500  # Table 3 "actions per episode"
 MAX_RECOMMENDATIONS = 100  # A.2, Table 3 "max. episode length"
 A, B, C, D, E = 14.0, 2.0, 0.3, 2.0, 6.0  # Eq. 2
 SIGMA_1 = 0.1  # A.2: scale of one perturbation of the user
-USER_BOUND = 100.0  # ours: a Gaussian has no bound; its std stays below 2, so 100 is never met
+USER_BOUND = 100.0  # ours: a Gaussian has no bound; its std stays near 2, so 100 is never met
 MU_STD = 3.0  # published code; the appendix does not say how mu_i is distributed
 ORGANIC, BANDIT, GONE = range(3)  # A.2 names the first two and "terminates stochastically"
 TRANSITIONS = np.array(  # published code; the appendix gives no numbers. Rows: now, columns: next
@@ -312,7 +312,7 @@ class RecSysEnv(gym.Env):
         if click:
             self.clicked.add(product)
         if self.render_mode is not None:
-            self.timeline.append((float(p_click), click, *self._reference_probabilities()))
+            self.timeline.append((float(p_click), reward > 0, *self._reference_probabilities()))
 
         self._draw()
         if click:
@@ -377,8 +377,11 @@ class RecSysEnv(gym.Env):
         return draw_timeline(self.timeline, ending)
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step: one here, as nothing moves between two recommendations."""
-        return [self.render()]
+        """Pictures of the last step: one here, as nothing moves between two recommendations.
+
+        None at all without render_mode.
+        """
+        return [self.render()] if self.render_mode else []
 
 
 gym.register("ActionGen/RecSys-v0", entry_point=f"{__name__}:RecSysEnv")
@@ -459,23 +462,28 @@ class RecSysVectorEnv(VectorEnv):
         self.recommendations[envs] = self.clicks[envs] = 0
         self._clicked[envs] = False
         if self.num_available < len(self.action_pool):
-            for i in envs:
-                self.available[i] = self._draw_available()
+            self.available[envs] = self._draw_available(len(envs))
 
-    def _draw_available(self) -> np.ndarray:
-        """A random set from the pool: (K,).
+    def _draw_available(self, count: int) -> np.ndarray:
+        """`count` random sets from the pool: (count, K).
 
-        Drawing each set by itself would cost as much as the rest of the step. A random permutation
+        Drawing the sets one by one would cost as much as the rest of the step. A random permutation
         of the pool, cut into blocks of K, gives many sets for the price of one, each of them
         exactly a uniform draw without replacement; only blocks of the same permutation depend on
-        each other (they are disjoint).
+        each other (they are disjoint). The bank holds one permutation per sub-environment and
+        hands out first all their first blocks, then all their second blocks, ..., so that such
+        blocks are far apart.
         """
-        if len(self._bank) == 0:
+        taken, self._bank = self._bank[:count], self._bank[count:]
+        if len(taken) < count:
             blocks = len(self.action_pool) // self.num_available
-            pool = self.np_random.permutation(self.action_pool)[: blocks * self.num_available]
-            self._bank = pool.reshape(blocks, self.num_available)  # (blocks, K)
-        available, self._bank = self._bank[0], self._bank[1:]
-        return available
+            pool = np.tile(self.action_pool, (self.num_envs, 1))
+            pool = self.np_random.permuted(pool, axis=1)[:, : blocks * self.num_available]
+            bank = pool.reshape(self.num_envs, blocks, -1).swapaxes(0, 1)  # (blocks, N, K)
+            bank = bank.reshape(-1, self.num_available)  # (blocks * N, K), first blocks first
+            missing = count - len(taken)
+            taken, self._bank = np.concatenate([taken, bank[:missing]]), bank[missing:]
+        return taken
 
     def _observation(self) -> dict[str, np.ndarray]:
         state = _state(self.users, self.unit_norm_state)

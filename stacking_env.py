@@ -803,7 +803,7 @@ class StackingEnv(gym.Env):
         pool = split_actions()["train"] if action_pool is None else action_pool
         self.action_pool = np.sort(check_ids(pool, distinct=True))
         size = len(self.action_pool)
-        if num_available not in range(1, size + 1):
+        if not isinstance(num_available, int | np.integer) or not 1 <= num_available <= size:
             raise ValueError(f"num_available must be in 1..{size} (the pool), got {num_available}")
         if placement not in PLACEMENTS:
             raise ValueError(f"unknown placement {placement!r}; allowed: {', '.join(PLACEMENTS)}")
@@ -1024,7 +1024,7 @@ class StackingEnv(gym.Env):
         """The scene in colour, (360, 360, 3) uint8 (None without render_mode)."""
         if self.render_mode is None:
             return None
-        if not hasattr(self, "_bodies"):
+        if not hasattr(self, "_bodies") or self._client < 0:
             raise ResetNeeded("call reset() before the first render()")
         return colour_picture(self.shape_ids, *self.poses(), caption=self._caption())
 
@@ -1033,8 +1033,10 @@ class StackingEnv(gym.Env):
 
         Empty without render_mode. Poses are recorded while simulating and painted only here.
         """
-        if self.render_mode is None or not self._bodies:
+        if self.render_mode is None:
             return []
+        if not hasattr(self, "_bodies") or self._client < 0:
+            raise ResetNeeded("call reset() before the first render_frames()")
         moments = self._trace[:12:2] + self._trace[12::6]  # the settling in brief
         frames = [
             colour_picture(self.shape_ids[: len(pose[0])], *pose, caption=self._caption(pose))

@@ -143,3 +143,29 @@ def test_bad_pools_are_refused(env_file):
     ):
         with pytest.raises(ValueError, match=word):
             module.make_vec(1, np.array(pool), K, 0).reset()
+
+
+def test_pictures_come_after_a_reset_and_only_where_they_were_asked_for(env_file):
+    name, module = env_file
+    make = getattr(module, {"gridworld": "GridWorldEnv", "recsys": "RecSysEnv",
+                            "create": "CreateEnv", "stacking": "StackingEnv"}[name])  # fmt: skip
+    env = make(render_mode="rgb_array")
+    for draw in (env.render, env.render_frames):
+        with pytest.raises(gym.error.ResetNeeded):
+            draw()
+    env.reset(seed=0)
+    frames = env.render_frames()
+    assert np.array_equal(frames[-1], env.render()) and frames[-1].dtype == np.uint8
+    env.close()
+    silent = make()
+    silent.reset(seed=0)
+    assert silent.render_frames() == []
+
+
+def test_registered_environments_can_be_written_down(env_file):
+    name, module = env_file
+    ids = [i for i in gym.registry if i.startswith("ActionGen/") and module.__name__ in
+           str(gym.spec(i).entry_point)]  # fmt: skip
+    assert len(ids) == (13 if name == "create" else 1)
+    for each in ids:
+        assert module.__name__ in gym.spec(each).to_json()

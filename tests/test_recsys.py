@@ -752,6 +752,28 @@ def test_no_repeat_reward_published_cells(weight_of_mu, expected):
 # ---- pictures, script ----
 
 
+def test_first_sets_of_the_sub_environments_are_independent():
+    """Overlap of two independent 500-subsets of 2,500: 500 * 500 / 2500 = 100 on average."""
+    overlaps = []
+    for seed in range(20):
+        available = make_vec(6, recsys.split_actions()["test"], 500, seed).reset()[0]["available"]
+        assert all(len(set(row)) == 500 for row in available)
+        overlaps += [len(set(available[i]) & set(available[i + 1])) for i in range(5)]
+    assert np.mean(overlaps) == pytest.approx(100, abs=4)  # 5 standard errors
+
+
+def test_the_timeline_counts_the_clicks_that_pay():
+    env = RecSysEnv(
+        recsys.split_actions()["test"], 1, no_repeat_reward=True, render_mode="rgb_array"
+    )
+    env.reset(seed=0)
+    over = False
+    while not over:  # the same product again and again: it pays once
+        *_, terminated, truncated, info = env.step(0)
+        over = terminated or truncated
+    assert info["clicks"] == sum(click for _, click, *_ in filter(None, env.timeline)) <= 1
+
+
 def test_render_frames_have_one_size_and_change():
     env = RecSysEnv(SMALL, 5, "rgb_array")
     env.reset(seed=1)
