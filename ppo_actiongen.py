@@ -117,7 +117,7 @@ class Args:
 
     # Adaptation to the unseen actions (C.2), the alternative to zero-shot
     adapt: bool = False
-    """Train on all test actions, one fixed set in every episode, from scratch."""
+    """Train on the test actions, one fixed set in every episode, from scratch."""
     finetune: str | None = None
     """--adapt, starting from this finished run's folder; give the flags of that run."""
 
@@ -135,7 +135,8 @@ class Args:
     subsample: bool = True
     """--no-subsample: all training actions are on offer in every episode (ablation)."""
     fixed_set_size: int | None = None
-    """With --no-subsample: only this many random training actions (published: 2,000 of recsys)."""
+    """With --no-subsample or --adapt, method utility: only this many random actions of the pool
+    (published: 2,000 of recsys)."""
 
     # Policy, Table 4
     learning_rate: float = 1e-3
@@ -167,7 +168,8 @@ class Args:
     lr_decay_steps: int | None = None
     """Steps over which it decays (default: total_timesteps)."""
     ent_floor: float = 1.0
-    """The entropy coefficient decays linearly to this fraction (ours; the paper: 1)."""
+    """The entropy coefficient decays linearly to this fraction, in the learning rate's steps (ours;
+    the paper: 1)."""
     clip_vloss: bool = True
     """Clip the value loss as PPO's original code does, on the raw value scale."""
     weight_decay: float = 0.0
@@ -908,7 +910,9 @@ def load_table(args: Args, train_ids: np.ndarray) -> np.ndarray:
             )
         table = hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
     if args.standardize:
-        table = (table - table[train_ids].mean(0)) / (table[train_ids].std(0) + 1e-8)
+        std = table[train_ids].std(0)
+        std[std < 1e-6] = 1.0  # constant in training: no scale to learn, whatever others have
+        table = (table - table[train_ids].mean(0)) / (std + 1e-8)
     return np.ascontiguousarray(table, dtype=np.float32)
 
 
@@ -1271,6 +1275,11 @@ def published_scores(args: Args) -> dict[str, float]:
     # Each variant was published alone and of our policy; analysis is a split without such numbers.
     if variants(args) not in ([], [method]) or args.split not in ("default", "full"):
         return {}
+    # So were the baselines, the ablations and the other representations: no two of them at once.
+    usual = PRESETS[args.env].representation == args.representation and args.modality is None
+    apart = [args.method != "utility", not args.subsample, args.ent_coef == 0, not usual]
+    if sum(apart) > 1:
+        return {}
     if path.exists():
         for row in csv.DictReader(path.open()):
             same_task = (row["task"] or None) in (args.task, None)
@@ -1431,7 +1440,8 @@ def check(args: Args) -> None:
     if args.micro_batch < 0:
         raise ValueError(f"micro_batch {args.micro_batch} is not allowed; at least 0")
     for name, value in vars(args).items():
-        if isinstance(value, float) and not math.isfinite(value):
+        values = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(v, float) and not math.isfinite(v) for v in values):
             raise ValueError(f"{name} {value} is not a finite number")
     if args.conv_gain is not None and args.conv_gain <= 0:
         raise ValueError(f"conv_gain {args.conv_gain} is not above 0 (or None)")
@@ -1439,6 +1449,21 @@ def check(args: Args) -> None:
         raise ValueError(f"explore {args.explore} is not at least 0 and below 1")
     if min(args.ent_coef, args.outcome_coef) < 0 or args.learning_rate <= 0:
         raise ValueError("ent_coef, outcome_coef must be at least 0 and learning_rate above 0")
+    for name in ("gamma", "gae_lambda", "lr_floor", "ent_floor"):
+        if not 0 <= getattr(args, name) <= 1:
+            raise ValueError(f"{name} {getattr(args, name)} is not in 0..1")
+    for name in ("clip_coef", "max_grad_norm"):
+        if getattr(args, name) <= 0:
+            raise ValueError(f"{name} {getattr(args, name)} is not above 0")
+    for name in ("vf_coef", "weight_decay", "aux_ent_scale"):
+        if getattr(args, name) < 0:
+            raise ValueError(f"{name} {getattr(args, name)} is not at least 0")
+    if args.minibatch_size * args.num_minibatches < 2:
+        raise ValueError("a rollout of one step has no spread to normalise advantages by")
+    modalities = importlib.import_module(MODULES[args.env]).MODALITIES
+    if args.modality is not None and args.modality not in modalities:
+        allowed = ", ".join(modalities) or "none"
+        raise ValueError(f"modality {args.modality!r} is not one of {args.env}'s: {allowed}")
     if args.task is not None and "task" not in TASK_OPTIONS.get(args.env, ()):
         raise ValueError(f"task {args.task!r}: {args.env} has no tasks")
     for name, usual in (("fully_observable", False), ("placement", None), ("subgoal_reward", True)):
@@ -1475,10 +1500,14 @@ def open_run(args: Args, device) -> tuple[Path, dict | None]:
         checkpoint = load_checkpoint(folder / "checkpoint.pt", device)
         for name, theirs, ours in difference(args, checkpoint["args"]):  # a run stays what it was
             raise ValueError(f"cannot resume {folder}: {name} is {theirs!r} there, {ours!r} here")
+        if "generator" not in checkpoint:
+            raise ValueError(f"{folder}/checkpoint.pt is not one to go on from (no 'generator')")
         if (ranks := checkpoint["generator"].shape[0]) != WORLD_SIZE:
             raise ValueError(f"cannot resume {folder}: {ranks} processes there, {WORLD_SIZE} here")
         return folder, checkpoint
     if folder.exists() and any(folder.iterdir()) and not args.resume and not RANK:
+        if args.overwrite and not (folder / "args.json").exists():
+            raise ValueError(f"{folder} is not a run's folder: --overwrite leaves it alone")
         if not args.overwrite:
             raise ValueError(
                 f"{folder} already holds a run; --resume goes on with it, --overwrite replaces it"
@@ -1521,6 +1550,11 @@ class Run:
             self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
             torch.cuda.set_device(self.device)
         self.pools, self.pool, self.num_available = action_pools(args)
+        if args.finetune is not None and not args.resume:  # `build` reads it; here: is it there?
+            load_checkpoint(Path(args.finetune) / "best.pt", "cpu")
+        K, least = args.eval_available, min(map(len, self.pools.values()))
+        if K is not None and not args.adapt and not 1 <= K <= least:
+            raise ValueError(f"eval_available {K} is not in 1..{least}, the smallest pool's size")
         self.batch_size = args.minibatch_size * args.num_minibatches  # T * N
         self.num_steps = self.batch_size // args.num_envs  # T
         self.num_updates = args.total_timesteps // self.batch_size
@@ -1536,18 +1570,22 @@ class Run:
         self.envs = make_envs(
             args, self.pool, self.num_envs, self.num_available, seeds(args, 1, 0, RANK)
         )
-        # Rank 0 first: the others find the representation that it makes.
-        for turn in (0, 1):
-            problem = None
-            if turn == min(RANK, 1):
-                try:
-                    self.folder, checkpoint = open_run(args, self.device)
-                    table = load_table(args, self.pools["train"])
-                except (ValueError, OSError) as e:
-                    problem = e
-            for e in filter(None, gathered(problem)):  # then all of them stop
-                raise e
-        self.build(table, checkpoint)
+        try:
+            # Rank 0 first: the others find the representation that it makes.
+            for turn in (0, 1):
+                problem = None
+                if turn == min(RANK, 1):
+                    try:
+                        self.folder, checkpoint = open_run(args, self.device)
+                        table = load_table(args, self.pools["train"])
+                    except (ValueError, OSError) as e:
+                        problem = e
+                for e in filter(None, gathered(problem)):  # then all of them stop
+                    raise e
+            self.build(table, checkpoint)
+        except BaseException:
+            self.envs.close()  # else their processes complain when this one ends
+            raise
         if not RANK:
             if args.overwrite and checkpoint is None and self.folder.exists():
                 shutil.rmtree(self.folder)
@@ -1773,6 +1811,10 @@ def finish(run: Run) -> dict:
         return results
     launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
     seen, unseen = CEILINGS.get(experiment_name(args), (None, None))
+    if args.env == "recsys":  # its ceilings are those of 500 products on offer
+        K = args.eval_available or args.num_available
+        unseen = unseen if K == 500 else None
+        seen = seen if K == 500 and run.num_available < len(run.pool) else None
     results |= {
         "metric": run.module.METRIC,
         "method": method_name(args),
@@ -1787,7 +1829,7 @@ def finish(run: Run) -> dict:
     write_atomically(folder / "results.json", lambda t: t.write_text(json.dumps(results, indent=1)))
     plot_curve(
         folder / "metrics.csv", folder / "curve.png", run.module.METRIC, results["published"],
-        unseen,
+        seen if args.adapt else unseen,
     )  # fmt: skip
     record_episode(run.agent, run.preprocess, args, run.pools["test"], folder / "episode.gif")
     print_table(results, run.module.METRIC)
@@ -1807,7 +1849,7 @@ class EvaluateArgs:
     actions: Literal["train", "valid", "test"] = "test"
     """Which actions are on offer."""
     num_available: int | None = None
-    """K (default: the run's)."""
+    """K (default: that of the scores in the run's results.json)."""
     episodes: int = 5000
     """Episodes to play."""
     seed: int = 0
@@ -1817,8 +1859,8 @@ class EvaluateArgs:
     min_angle_gap: float | None = None
     """CREATE: only tools at least so many degrees from every training tool of their class."""
     min_embedding_distance: str | None = None
-    """Only actions whose representation is farther than this squared distance from that of every
-    training action; q0.5: farther than this quantile of the pool."""
+    """Only actions whose representation has at least this squared distance from that of every
+    training action; q0.5: at least this quantile of the pool."""
     unseen_ratio: float | None = None
     """Offer a mixture: this share of the pool's actions, the rest training actions."""
     save: bool = False
@@ -1887,14 +1929,15 @@ def evaluate_run(options: EvaluateArgs) -> dict:
         raise ValueError(f"{options.run}: its environment {args.env!r} is not one of {[*MODULES]}")
     if options.seed < 0:
         raise ValueError(f"seed {options.seed} is not allowed; at least 0")
-    pools, pool, _ = action_pools(args)
-    if options.actions != "train" or args.adapt:  # "train" is what a fixed set was drawn from ...
-        pool = pools[options.actions]  # ... and not what a run has adapted to, test actions
+    pools, pool, on_offer = action_pools(args)
+    whole = on_offer == len(pool)  # trained, and scored, with one whole set on offer
+    if options.actions != ("test" if args.adapt else "train"):
+        pool, whole = pools[options.actions], False
     table, train_ids = (checkpoint["agent"][k].numpy() for k in ("table", "train_ids"))
     pool = restrict_pool(options, args, checkpoint["agent"]["table"], pool, train_ids)
     K = options.num_available
     if K is None:
-        K = args.eval_available or args.num_available
+        K = len(pool) if whole else args.eval_available or args.num_available
     if not 1 <= K <= len(pool) or options.episodes < 1:
         raise ValueError(f"num_available {K} is not in 1..{len(pool)}, or episodes is below 1")
     envs = make_envs(args, pool, 1, K, 0)
@@ -1914,6 +1957,8 @@ def evaluate_run(options: EvaluateArgs) -> dict:
         columns = EVALUATION_KEYS + "pool_size score stderr return length".split()
         row = {k: "" if named[k] is None else str(named[k]) for k in columns}
         old = list(csv.DictReader(path.open())) if path.exists() else []
+        if any(set(columns) - set(r) for r in old):
+            raise ValueError(f"{path} has other columns than {', '.join(columns)}: move it away")
         rows = [r for r in old if any(r[k] != row[k] for k in EVALUATION_KEYS)] + [row]
         text = "\n".join([",".join(columns), *(",".join(r[k] for k in columns) for r in rows)])
         write_atomically(path, lambda temporary: temporary.write_text(text + "\n"))
@@ -1944,6 +1989,8 @@ def main() -> None:
         raise SystemExit(usage)
     try:
         if argv[0] == "evaluate":
+            if WORLD_SIZE > 1:
+                raise ValueError("evaluate is one process: python ppo_actiongen.py evaluate ...")
             evaluate_run(tyro.cli(EvaluateArgs, args=argv[1:]))
             return
         # The recipe decides the defaults that --help shows, so it is looked at first.
@@ -1956,6 +2003,8 @@ def main() -> None:
             backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
             dist.init_process_group(backend, timeout=timedelta(days=3))
         args = tyro.cli(Args, args=argv[1:], default=default)
+        if (args.recipe, args.quick) != (default.recipe, default.quick):
+            raise ValueError("--recipe and --quick may be given only once")
         train(replace(args, adapt=args.adapt or args.finetune is not None))
     except (ValueError, OSError) as e:
         raise SystemExit(1 if RANK else f"error: {e}") from None

@@ -471,7 +471,8 @@ def all_curves(experiment: str, path: Path) -> None:
                 for color, key in (("C0", "train_score"), ("C1", "valid_score")):
                     axis.plot(steps, [float(r[key]) for r in one], color, lw=1, marker=".", ms=2)
             axis.set_ylim(0, 1.05 * top + 1e-6)
-            axis.set_title(f"{paper.TITLES[env]}\n{METHODS[method]}", fontsize=7)
+            title = paper.TITLES[env].removesuffix(", partially observable")
+            axis.set_title(f"{title}\n{METHODS[method]}", fontsize=7)
             axis.tick_params(labelsize=6)
         line[0].set_ylabel(quantity(env), fontsize=7)
     figure.suptitle("seen (blue) and validation actions (orange) over million steps", fontsize=9)

@@ -735,6 +735,12 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
     (folder,) = tmp_path.glob("gridworld-*")
     assert 0 <= json.loads((folder / "results.json").read_text())["train"]["score"] <= 1
     assert "unseen" in capsys.readouterr().out
+    # Scored again with as many on offer: a whole set, where the run was trained with one.
+    test = ["evaluate", str(folder), "--actions", "train", "--episodes", "8"]
+    monkeypatch.setattr(sys, "argv", ["ppo_actiongen.py", *test])
+    ppo.main()
+    K = 512 if "nearest-neighbor" in extra else 60 if "--no-subsample" in extra else 50
+    assert f"train actions, K={K}, 8 episodes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -761,6 +767,15 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--lr-decay-steps", "0"], "lr_decay_steps 0"),
         (["--no-subgoal-reward"], "subgoal_reward is not an option of gridworld"),
         (["--utility", "bilinear", "--outcome-coef", "1"], "no hidden layer"),
+        (["--utility-gains", "1", "1", "nan"], "utility_gains (1.0, 1.0, nan) is not a finite"),
+        (["--gamma", "2"], "gamma 2.0 is not in 0..1"),
+        (["--max-grad-norm", "0"], "max_grad_norm 0.0 is not above 0"),
+        (["--weight-decay", "-1"], "weight_decay -1.0 is not at least 0"),
+        (["--modality", "smell"], "modality 'smell' is not one of gridworld's: xy, onehot"),
+        (["--eval-available", "300"], "eval_available 300 is not in 1..256"),
+        (["--recipe", "paper", "--recipe", "fast"], "may be given only once"),
+        (["--quick", "--no-quick"], "may be given only once"),
+        (["--num-envs", "1", "--minibatch-size", "1", "--num-minibatches", "1"], "rollout of one"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_leaves_nothing(
@@ -781,6 +796,8 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(
         (["create", "--task", "bogus"], "unknown task 'bogus'"),
         (["create", "--one-hot"], "the states of create are pictures"),
         (["stacking", "--placement", "3d"], "unknown placement '3d'"),
+        (["recsys", "--modality", "xy"], "modality 'xy' is not one of recsys's: none"),
+        (["gridworld", "--finetune", "nowhere"], "no checkpoint at nowhere"),
     ],
 )
 def test_a_wrong_option_shows_before_an_encoder_is_trained(tmp_path, words, message, monkeypatch):
@@ -800,6 +817,37 @@ def test_a_refused_overwrite_leaves_the_old_run(finished, monkeypatch):
     with pytest.raises(SystemExit, match="nofile.npz"):
         ppo.main()
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_overwrite_throws_away_runs_only(tmp_path, monkeypatch):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.txt").write_text("three years")
+    for name in ("thesis", "."):
+        words = ["--overwrite", "--run-name", name]
+        monkeypatch.setattr(sys, "argv", command(tmp_path, *words, steps=768)[1:])
+        with pytest.raises(SystemExit, match="is not a run's folder: --overwrite leaves it alone"):
+            ppo.main()
+    assert (tmp_path / "thesis" / "chapter.txt").read_text() == "three years"
+
+
+def test_a_refused_run_of_processes_ends_quietly(tmp_path):
+    words = "--representation engineered --num-envs 2 --minibatch-size 2 --total-timesteps 64"
+    start = [sys.executable, str(ROOT / "ppo_actiongen.py"), "stacking", *words.split()]
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "args.json").write_text("{}")
+    result = run([*start, "--runs-dir", str(tmp_path), "--run-name", "there"])
+    lines = [line for line in result.stderr.splitlines() if "pybullet build time" not in line]
+    assert len(lines) == 1 and "already holds a run" in lines[0]
+
+
+def test_columns_that_are_constant_in_training_do_not_blow_up():
+    args = ppo.default_args("stacking", "fast", False)
+    args = replace(args, representation="engineered", split="full", standardize=True)
+    pools, *_ = ppo.action_pools(args)
+    table = ppo.load_table(args, pools["train"])
+    assert np.abs(table).max() < 100
+    spread = table[pools["train"]].std(0)
+    assert (np.isclose(spread, 1, atol=1e-3) | (spread < 1e-3)).all() and (spread < 1e-3).any()
 
 
 class OnAnotherDevice:
@@ -840,6 +888,11 @@ def test_published_numbers_stand_only_beside_what_was_published():
         assert bool(ppo.published_scores(stacking)) == there
         stacking.representation = "hvae"
         assert ppo.published_scores(stacking)
+    # An ablation or a baseline was published with the usual representation only.
+    for changes in (dict(ent_coef=0), dict(subsample=False), dict(method="nearest-neighbor")):
+        usual = replace(ppo.default_args("gridworld", "fast", False), **changes)
+        assert ppo.published_scores(usual)
+        assert not ppo.published_scores(replace(usual, representation="engineered"))
 
 
 def test_unknown_environment_and_recipe(monkeypatch):
