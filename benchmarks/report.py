@@ -722,8 +722,12 @@ def tsne_figure(experiment: str, path: Path) -> None:
         p for p in paper.EXPERIMENTS[experiment].encoders if any(r["panel"] == p for r in rows)
     ]
     names = sorted({r["label"] for r in rows})
-    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 4.2), squeeze=False)
-    for axis, panel in zip(axes.flat, panels, strict=True):
+    across = len(panels) if len(panels) < 5 else -(-len(panels) // 2)  # many: two lines
+    down = -(-len(panels) // across)
+    figure, axes = plt.subplots(down, across, figsize=(4 * across, 4.2 * down), squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.axis("off")
+    for axis, panel in zip(axes.flat, panels, strict=False):
         for i, name in enumerate(names):
             mine = [r for r in rows if (r["panel"], r["label"]) == (panel, name)]
             color = colorsys.hls_to_rgb((i / len(names) + 0.7) % 1, 0.6, 0.9)  # as in hvae.py
@@ -737,7 +741,7 @@ def tsne_figure(experiment: str, path: Path) -> None:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     columns = min(8, len(names))
     figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False, fontsize=7)
-    figure.tight_layout(rect=(0, 0.04 + 0.04 * -(-len(names) // columns), 1, 1))
+    figure.tight_layout(rect=(0, (0.04 + 0.04 * -(-len(names) // columns)) / down, 1, 1))
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
