@@ -119,6 +119,10 @@ RECIPE = {
     },
     "create-recipe": {
         "fast": ("none: the fast recipe", ""),
+        "clip_0.1": (
+            "PPO's clip at 0.1",
+            "0.3: goals are rare, and each may raise what led to it by three tenths at once",
+        ),
         "conv_default": (
             "convolutions as PyTorch initialises them",
             "orthogonal, gain sqrt 2: else the code hardly tells two pictures apart at first",
@@ -136,7 +140,7 @@ RECIPE = {
 RECIPE_NOTE = {
     "gridworld-recipe": "Engineered representation; each row down to the narrow networks keeps "
     "what those above it have undone, and each one below them keeps all of that",
-    "create-recipe": "Learned representation",
+    "create-recipe": "Learned representation; each row below the clip's keeps 0.1",
 }
 
 
