@@ -48,6 +48,7 @@ METHODS = {
     "ours_fast": "Fast recipe",
     "engineered_fast": "Fast recipe, engineered",
     "ours_predicts": "Ours, predicting outcomes",
+    "ours_clip": "Ours, clip 0.3",
     "ours_bilinear": "Ours, bilinear utility",
     "ours_video": "Ours, video",
     "ours_no_subgoal_reward": "No subgoal reward",
@@ -119,10 +120,6 @@ RECIPE = {
     },
     "create-recipe": {
         "fast": ("none: the fast recipe", ""),
-        "clip_0.1": (
-            "PPO's clip at 0.1",
-            "0.3: goals are rare, and each may raise what led to it by three tenths at once",
-        ),
         "conv_default": (
             "convolutions as PyTorch initialises them",
             "orthogonal, gain sqrt 2: else the code hardly tells two pictures apart at first",
@@ -140,7 +137,7 @@ RECIPE = {
 RECIPE_NOTE = {
     "gridworld-recipe": "Engineered representation; each row down to the narrow networks keeps "
     "what those above it have undone, and each one below them keeps all of that",
-    "create-recipe": "Learned representation; each row below the clip's keeps 0.1",
+    "create-recipe": "Learned representation",
 }
 
 

@@ -66,6 +66,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_wide",
             "ours_outcome",
             "ours_predicts",
+            "ours_clip",
             "ours_fast",
             "engineered_fast",
             "ours_analysis",
