@@ -337,9 +337,7 @@ QUICK = {
     # A clip of 0.3 lets each rare goal teach three times as much: in push, 0.27 instead of 0.18 on
     # unseen tools after 0.4M steps (two seeds). Where goals are rarer still, as in seesaw, the
     # policy stops exploring before it has found any, so this is not in FAST.
-    "create": dict(
-        total_timesteps=200_000, clip_coef=0.3, hvae_recipe="quick", eval_episodes=500
-    ),
+    "create": dict(total_timesteps=200_000, clip_coef=0.3, hvae_recipe="quick", eval_episodes=500),
     "stacking": dict(total_timesteps=60_000, hvae_recipe="quick", eval_episodes=500),
 }
 
