@@ -176,6 +176,9 @@ class Args:
     """Decoupled weight decay on the utility's weights (ours; 0 = the paper's)."""
     conv_gain: float | None = None
     """Orthogonal gain of the image encoder's convolutions (None: PyTorch's own initialisation)."""
+    shrink: Literal[1, 2, 4] = 1
+    """Pictures become this many times smaller a side before the convolutions, blocks of pixels
+    averaged (ours; the paper: 1)."""
     utility_gains: tuple[float, float, float] = (0.01, 0.01, 0.01)
     """Orthogonal gains of the utility's projection, hidden and output layer."""
     one_hot: bool = False
@@ -308,6 +311,10 @@ FAST = {
         total_timesteps=10_000_000,
     ),
     "create": dict(
+        # Half the pixels a side: the convolutions cost a third, and what is learned from the same
+        # steps is the same. A ball is still 4 pixels across.
+        shrink=2,
+        micro_batch=256,  # a minibatch at once: with these pictures it fits
         conv_gain=math.sqrt(2),  # PyTorch's own shrinks what differs between two pictures 100 times
         utility_gains=(1.0, math.sqrt(2), 0.01),
         # A goal is worth 10, so the critic's loss is a thousand times the policy's. They share the
@@ -405,12 +412,11 @@ class StateEncoder(nn.Module):
         self.is_image, self.bf16 = len(space.shape) == 3, args.bf16
         self.num_ids = int(space.high.max()) + 1 if args.one_hot else None  # see Preprocess
         if self.is_image:
-            # 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side (published code; the appendix: 5 layers)
-            channels = [space.shape[0], 16, 16, 32, 32, 32]
-            convs = [
-                nn.Conv2d(i, o, 3, stride=2, padding=1)
-                for i, o in zip(channels, channels[1:], strict=False)
-            ]
+            # 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side (published code; the appendix: 5 layers).
+            # A picture that comes at half its size needs one layer less.
+            outputs = [16, 16, 32, 32, 32][int(math.log2(args.shrink)) :]
+            channels = zip([space.shape[0], *outputs], outputs, strict=False)  # into and out of
+            convs = [nn.Conv2d(i, o, 3, stride=2, padding=1) for i, o in channels]
             for conv in convs:
                 if args.conv_gain is not None:
                     layer_init(conv, args.conv_gain, generator)
@@ -449,7 +455,10 @@ class StateEncoder(nn.Module):
         return torch.tanh(self.actor_hidden(actor)), torch.tanh(self.critic_hidden(critic))
 
     def convolve(self, state: torch.Tensor) -> torch.Tensor:
-        """Frames (B, 84, 84, C) uint8, see Preprocess -> features (B, 32 * 3 * 3) float32."""
+        """Frames (B, 84, 84, C) uint8, see Preprocess -> features (B, 32 * 3 * 3) float32.
+
+        With `shrink` 2 or 4 the frames are (B, 42, 42, C) or (B, 21, 21, C).
+        """
         device, first = state.device, self.conv[0]
         bf16 = fast_bf16(device) if self.bf16 is None else self.bf16
         x = state.to(torch.bfloat16 if bf16 else torch.float32)  # 0 ... 255: exact in both
@@ -922,12 +931,14 @@ class Preprocess:
     Vector states: numbers are normalised by running statistics, which stand still at evaluation;
     with `one_hot`, integer ids are renumbered 0, 1, 2, ... (Grid World uses 6 of the ids 0..11), so
     that the one-hot vectors hold no entry that never occurs. Image states stay uint8; they become
-    (N, 84, 84, C), the order the convolutions read, once here instead of in every epoch.
+    (N, 84, 84, C), the order the convolutions read, once here instead of in every epoch. With
+    `shrink` 2, every 2 x 2 pixels become their mean: (N, 42, 42, C).
     `space` describes the result; `first_states` (N, ...) shows which ids there are.
     """
 
     def __init__(self, space: gym.spaces.Box, args: Args, first_states=None):
         self.one_hot, self.is_image = args.one_hot, len(space.shape) == 3
+        self.shrink = args.shrink
         self.normalizes = args.norm_obs and not (self.one_hot or self.is_image)
         self.stats, self.space, self.ids = RunningMeanStd(space.shape), space, np.zeros(0, int)
         if self.one_hot:
@@ -945,7 +956,10 @@ class Preprocess:
         if self.one_hot:
             return torch.from_numpy(self.number[state])
         if self.is_image:
-            return torch.as_tensor(state).permute(0, 2, 3, 1).contiguous()  # (N, 84, 84, C)
+            frames = torch.as_tensor(state)  # (N, C, 84, 84)
+            if self.shrink > 1:  # -> (N, C, 84 / shrink, 84 / shrink), rounded
+                frames = F.avg_pool2d(frames.float(), self.shrink).round_().byte()
+            return frames.permute(0, 2, 3, 1).contiguous()  # (N, 84, 84, C)
         x = self.stats.normalize(state) if self.normalizes else state.astype(np.float32)
         return torch.from_numpy(x).clone()  # into aligned memory, see Agent
 
@@ -1471,6 +1485,8 @@ def check(args: Args) -> None:
             raise ValueError(f"{name} is not an option of {args.env}")
     if args.outcome_coef and (args.method, args.utility) == ("utility", "bilinear"):
         raise ValueError("outcome_coef: the bilinear utility has no hidden layer to predict with")
+    if args.shrink != 1 and args.env in ("gridworld", "recsys"):
+        raise ValueError(f"shrink {args.shrink}: the states of {args.env} are no pictures")
     if args.one_hot and args.env in ("create", "stacking"):
         raise ValueError(f"one_hot: the states of {args.env} are pictures")
     if args.adapt and args.method == "continuous":

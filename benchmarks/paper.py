@@ -124,6 +124,7 @@ RUNS: dict[str, dict[str, str]] = {
     },
     "create-recipe": {
         "fast": "create",
+        "pictures_84": "create --shrink 1",
         "conv_default": "create --conv-gain None",
         "value_coefficient_0.5": "create --vf-coef 0.5",
         "minibatch_3072": "create --minibatch-size 3072",

@@ -120,6 +120,10 @@ RECIPE = {
     },
     "create-recipe": {
         "fast": ("none: the fast recipe", ""),
+        "pictures_84": (
+            "pictures of 84 x 84 pixels",
+            "42 x 42: twice as fast (all other rows are with 42 x 42)",
+        ),
         "conv_default": (
             "convolutions as PyTorch initialises them",
             "orthogonal, gain sqrt 2: else the code hardly tells two pictures apart at first",

@@ -394,11 +394,12 @@ def cosine(a, b):
     return F.cosine_similarity(a.flatten().double(), b.flatten().double(), dim=0).item()
 
 
-@pytest.mark.parametrize("channels", [3, 4])
-def test_fast_convolutions_equal_the_plain_ones(channels):
+@pytest.mark.parametrize("channels, shrink", [(3, 1), (4, 1), (3, 2), (3, 4)])
+def test_fast_convolutions_equal_the_plain_ones(channels, shrink):
     space = gym.spaces.Box(0, 255, (channels, 84, 84), np.uint8)
-    agent, _ = make_agent(HYBRID, space)
-    encoder, state = agent.encoder, torch.randint(0, 256, (40, 84, 84, channels)).byte()
+    agent, _ = make_agent(HYBRID, space, shrink=shrink)
+    size = 84 // shrink
+    encoder, state = agent.encoder, torch.randint(0, 256, (40, size, size, channels)).byte()
     out, grad = gradient_of(lambda s: plain_features(encoder, s), encoder, state)
     encoder.bf16 = False
     same_out, same_grad = gradient_of(encoder.convolve, encoder, state)
@@ -410,6 +411,18 @@ def test_fast_convolutions_equal_the_plain_ones(channels):
     # bfloat16 keeps 8 bits: a number is off by one part in 512 at most, in five layers.
     assert (near_out - out).norm() / out.norm() < 5 / 512 and cosine(near_out, out) > 0.9999
     assert (near_grad - grad).norm() / grad.norm() < 10 / 512 and cosine(near_grad, grad) > 0.9999
+
+
+@pytest.mark.parametrize("shrink", [1, 2, 4])
+def test_shrunk_pictures_are_means_of_blocks(shrink):
+    args, rng = replace(ppo.PRESETS["create"], shrink=shrink), np.random.default_rng(0)
+    state = rng.integers(0, 256, (2, 3, 84, 84), dtype=np.uint8)
+    frames = ppo.Preprocess(FRAMES, args)(state)
+    size = 84 // shrink
+    assert frames.shape == (2, size, size, 3) and frames.dtype == torch.uint8
+    for n, y, x, c in rng.integers(0, (2, size, size, 3), (50, 4)):
+        block = state[n, c, y * shrink : (y + 1) * shrink, x * shrink : (x + 1) * shrink]
+        assert frames[n, y, x, c] == round(block.mean())
 
 
 def test_initial_encoder_tells_pictures_apart_only_with_a_gain():
@@ -749,6 +762,7 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--num-available", "0"], "num_available 0"),
         (["--num-available", "600"], "600 is more than the 512"),
         (["--conv-gain", "-1"], "conv_gain -1.0 is not above 0"),
+        (["--shrink", "2"], "shrink 2: the states of gridworld are no pictures"),
         (["--explore", "1"], "explore 1.0 is not at least 0 and below 1"),
         (["--outcome-coef", "-1"], "outcome_coef must be at least 0"),
         (["--vf-coef", "nan"], "vf_coef nan is not a finite number"),
