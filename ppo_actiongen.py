@@ -956,10 +956,11 @@ class Preprocess:
         if self.one_hot:
             return torch.from_numpy(self.number[state])
         if self.is_image:
-            frames = torch.as_tensor(state)  # (N, C, 84, 84)
-            if self.shrink > 1:  # -> (N, C, 84 / shrink, 84 / shrink), rounded
-                frames = F.avg_pool2d(frames.float(), self.shrink).round_().byte()
-            return frames.permute(0, 2, 3, 1).contiguous()  # (N, 84, 84, C)
+            if (k := self.shrink) > 1:  # five times as fast as avg_pool2d of floats
+                rows = sum(state[:, :, i::k].astype(np.uint16) for i in range(k))
+                total = sum(rows[..., i::k] for i in range(k))  # (N, C, 84 / k, 84 / k)
+                state = ((total + k * k // 2) // (k * k)).astype(np.uint8)  # rounded
+            return torch.as_tensor(state).permute(0, 2, 3, 1).contiguous()  # (N, 84, 84, C)
         x = self.stats.normalize(state) if self.normalizes else state.astype(np.float32)
         return torch.from_numpy(x).clone()  # into aligned memory, see Agent
 
