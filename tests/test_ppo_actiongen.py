@@ -425,6 +425,22 @@ def test_shrunk_pictures_are_means_of_blocks(shrink):
         assert frames[n, y, x, c] == int(block.mean() + 0.5)
 
 
+def test_white_is_zero_shows_ink_and_neither_paper_nor_frames_that_do_not_exist():
+    args = replace(ppo.PRESETS["create"], white_is_zero=True, norm_features=True)
+    state = np.full((2, 3, 84, 84), 255, np.uint8)
+    state[0, 2, 10:20, 30:40] = 100
+    state[1, 0] = 0  # before the episode
+    frames = ppo.Preprocess(FRAMES, args)(state)
+    assert frames.dtype == torch.uint8 and frames.sum() == 100 * 155
+    assert (frames[0, 10:20, 30:40, 2] == 155).all()
+    # Empty space adds nothing: without biases the features of a white picture are 0.
+    agent, _ = make_agent(HYBRID, FRAMES, norm_features=True, conv_gain=4.0)
+    assert agent.encoder.convolve(frames)[1].abs().max() == 0
+    # Normalised features: twice the ink, the same code.
+    near, far = (agent.encoder(frames[:1] // 155 * ink)[0] for ink in (60, 120))
+    torch.testing.assert_close(near, far, rtol=0.05, atol=0.02)
+
+
 def test_initial_encoder_tells_pictures_apart_only_with_a_gain():
     """What differs between two pictures is in the code from the start, not a thousandth of it."""
     space = gym.spaces.Box(0, 255, (3, 84, 84), np.uint8)
@@ -762,7 +778,8 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--num-available", "0"], "num_available 0"),
         (["--num-available", "600"], "600 is more than the 512"),
         (["--conv-gain", "-1"], "conv_gain -1.0 is not above 0"),
-        (["--shrink", "2"], "shrink 2: the states of gridworld are no pictures"),
+        (["--shrink", "2"], "shrink: the states of gridworld are no pictures"),
+        (["--norm-features"], "norm_features: the states of gridworld are no pictures"),
         (["--explore", "1"], "explore 1.0 is not at least 0 and below 1"),
         (["--outcome-coef", "-1"], "outcome_coef must be at least 0"),
         (["--vf-coef", "nan"], "vf_coef nan is not a finite number"),
