@@ -351,7 +351,7 @@ FAST = {
 QUICK = {
     "gridworld": dict(total_timesteps=1_500_000, hvae_recipe="quick"),
     "recsys": dict(total_timesteps=1_000_000),
-    "create": dict(total_timesteps=300_000, hvae_recipe="quick", eval_episodes=500),
+    "create": dict(total_timesteps=400_000, hvae_recipe="quick", eval_episodes=500),
     "stacking": dict(total_timesteps=60_000, hvae_recipe="quick", eval_episodes=500),
 }
 

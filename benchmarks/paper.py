@@ -71,6 +71,10 @@ ADAPT = {  # C.2: learn on the unseen actions themselves, all of them on offer
 PLAIN = "--outcome-coef 0 --explore 0"
 NARROW = f"gridworld --hidden-size 64 --utility-hidden 128 {PLAIN}"
 LSTM = f"{NARROW} --hvae-recipe lstm"
+# CREATE's methods are compared with pictures as the paper's policy sees them, and what goes with
+# them. The fast recipe's, twice as fast, are a row of their own.
+AS_IS = "--shrink 1 --no-white-is-zero --no-norm-features --learning-rate 0.001 --micro-batch 128"
+PICTURES = f"{AS_IS} --clip-coef 0.1"
 MAIN_TASKS = "push obstacle seesaw".split()  # CREATE in the main paper
 MORE_TASKS = "navigate cannon ladder belt buckets basket collide moving funnel".split()  # Figure 8
 
@@ -124,10 +128,10 @@ RUNS: dict[str, dict[str, str]] = {
     },
     "create-recipe": {
         "fast": "create",
-        "pictures_84": "create --shrink 1",
-        "conv_default": "create --conv-gain None",
-        "value_coefficient_0.5": "create --vf-coef 0.5",
-        "minibatch_3072": "create --minibatch-size 3072",
+        "pictures_as_is": f"create {PICTURES}",
+        "conv_default": f"create {PICTURES} --conv-gain None",
+        "value_coefficient_0.5": f"create {PICTURES} --vf-coef 0.5",
+        "minibatch_3072": f"create {PICTURES} --minibatch-size 3072",
     },
     "recsys": {
         "ours": "recsys --utility mlp",
@@ -151,17 +155,20 @@ RUNS["recsys-full"] = {
 # ours: two thousand products on offer in every step cost twenty times the usual hundred
 RUNS["recsys"] |= commands("recsys --utility mlp", ADAPT, end="--budget 0.1")
 for task in MAIN_TASKS + MORE_TASKS:
-    RUNS[f"create-{task}"] = commands(f"create --task {task}", BASELINES)
+    RUNS[f"create-{task}"] = commands(f"create --task {task} {PICTURES}", BASELINES)
 for task in MAIN_TASKS:
-    RUNS[f"create-{task}"] |= commands(f"create --task {task}", ORACLE, VARIANTS)
+    start = f"create --task {task} {PICTURES}"
+    RUNS[f"create-{task}"] |= commands(start, ORACLE, VARIANTS)
     # published code: 5e6 to 2e7 of 6e7 steps
-    RUNS[f"create-{task}"] |= commands(f"create --task {task}", ADAPT, end="--budget 0.25")
-RUNS["create-seesaw"] |= commands("create --task seesaw", ENGINEERED)  # published here only
+    RUNS[f"create-{task}"] |= commands(start, ADAPT, end="--budget 0.25")
+    RUNS[f"create-{task}"]["ours_fast"] = f"create --task {task}"  # beyond the paper
+# Published for seesaw only.
+RUNS["create-seesaw"] |= commands(f"create --task seesaw {PICTURES}", ENGINEERED)
 # Beyond the paper: the loss of Grid World's fast recipe, scaled down because a goal is worth 10.
-RUNS["create-push"]["ours_predicts"] = "create --task push --outcome-coef 0.05"
+RUNS["create-push"]["ours_predicts"] = f"create --task push {PICTURES} --outcome-coef 0.05"
 # A wider clip, so that each rare goal teaches more.
 for task in ("push", "seesaw"):
-    RUNS[f"create-{task}"]["ours_clip"] = f"create --task {task} --clip-coef 0.3"
+    RUNS[f"create-{task}"]["ours_clip"] = f"create --task {task} {AS_IS} --clip-coef 0.3"
 
 
 # ---- every figure and analysis: the runs it shows, and what they are tested with ----
@@ -322,6 +329,7 @@ RATES = {  # environment steps per second of one run on one core: benchmarks/thr
     "create": 800,
     "stacking": 100,
 }
+SHRUNK_RATE = 1_100  # CREATE with the fast recipe's pictures
 WIDE_RATE = 4_000  # Grid World with the fast recipe's networks, as measured by its runs
 # Our policy with whole sets in every step: w/o sub-sampling 512 skills or 2,000 products, and to
 # adapt 256 or 2,500. CREATE's and Stacking's bill is pictures and physics all the same.
@@ -549,6 +557,7 @@ def make_run(env: str, method: str, seed: int, args: Args) -> Run:
         name += f"-{args.hvae_recipe}"
     wide = words[0] == "gridworld" and "--hidden-size" not in words and args.recipe == "fast"
     rates = RATES | ({"gridworld": WIDE_RATE} if wide else {})
+    rates |= {"create": SHRUNK_RATE} if "--shrink" not in words and args.recipe == "fast" else {}
     whole = {"--no-subsample", "--adapt", "--finetune"} & set(words) and "--method" not in words
     rate = args.rate or (rates | (WHOLE_RATES if whole else {}))[words[0]]
     folder = Path(args.runs_dir) / name
