@@ -316,7 +316,7 @@ FAST = {
         total_timesteps=10_000_000,
     ),
     "create": dict(
-        shrink=2,  # convolutions at a third of the cost, and a ball is still 4 pixels across
+        shrink=2,  # an update costs less than half, and a ball is still 4 pixels across
         # White paper with a few lines on it: as it comes, what all pictures share drowns what tells
         # them apart, and the policy learns one place for its tools whatever the picture shows.
         white_is_zero=True,

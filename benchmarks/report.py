@@ -141,7 +141,8 @@ RECIPE = {
 RECIPE_NOTE = {
     "gridworld-recipe": "Engineered representation; each row down to the narrow networks keeps "
     "what those above it have undone, and each one below them keeps all of that",
-    "create-recipe": "Learned representation",
+    "create-recipe": "Learned representation; the second row pays later (2M steps above), and each "
+    "one below it keeps what it has undone",
 }
 
 
