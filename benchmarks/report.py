@@ -122,7 +122,7 @@ RECIPE = {
         "fast": ("none: the fast recipe", ""),
         "pictures_as_is": (
             "84 x 84 pixels, 255 for white, raw features; learning rate 0.001, clip 0.1",
-            "42 x 42, 0 for white, normalised features; 0.0003, 0.2: updates at half the cost, and it sees",
+            "42 x 42, 0 for white, normalised features; 0.0003, 0.2: cheaper updates, and it sees",
         ),
         "conv_default": (
             "convolutions as PyTorch initialises them",
