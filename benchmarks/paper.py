@@ -73,7 +73,10 @@ NARROW = f"gridworld --hidden-size 64 --utility-hidden 128 {PLAIN}"
 LSTM = f"{NARROW} --hvae-recipe lstm"
 # CREATE's methods are compared with pictures as the paper's policy sees them, and what goes with
 # them. The fast recipe's, twice as fast, are a row of their own.
-AS_IS = "--shrink 1 --no-white-is-zero --no-norm-features --learning-rate 0.001 --micro-batch 128"
+AS_IS = (
+    "--shrink 1 --no-white-is-zero --no-norm-features --encoder-rate 1 --no-standardize "
+    "--ent-floor 1 --micro-batch 128"
+)
 PICTURES = f"{AS_IS} --clip-coef 0.1"
 MAIN_TASKS = "push obstacle seesaw".split()  # CREATE in the main paper
 MORE_TASKS = "navigate cannon ladder belt buckets basket collide moving funnel".split()  # Figure 8
