@@ -129,8 +129,13 @@ RUNS: dict[str, dict[str, str]] = {
         "--representation engineered",
         "gains_0.01": f"{NARROW} --representation engineered --utility-gains 0.01 0.01 0.01",
     },
+    # One difference undone, for the first four; then pictures as they are, and one more each.
     "create-recipe": {
         "fast": "create",
+        "clip_0.1": "create --clip-coef 0.1",
+        "encoder_rate_1": "create --encoder-rate 1",
+        "not_standardized": "create --no-standardize",
+        "entropy_constant": "create --ent-floor 1",
         "pictures_as_is": f"create {PICTURES}",
         "conv_default": f"create {PICTURES} --conv-gain None",
         "value_coefficient_0.5": f"create {PICTURES} --vf-coef 0.5",

@@ -126,9 +126,19 @@ RECIPE = {
     },
     "create-recipe": {
         "fast": ("none: the fast recipe", ""),
+        "clip_0.1": ("clip 0.1", "0.3: goals are rare, so each one teaches more"),
+        "encoder_rate_1": (
+            "convolutions learn as fast as the heads",
+            "at 0.3 of the rate: else they learn single pictures by heart",
+        ),
+        "not_standardized": (
+            "representations as they come",
+            "mean 0, std 1 over training actions",
+        ),
+        "entropy_constant": ("constant entropy coefficient", "decays to a tenth"),
         "pictures_as_is": (
-            "84 x 84 pixels, 255 for white, raw features; learning rate 0.001, clip 0.1",
-            "42 x 42, 0 for white, normalised features; 0.0003, 0.2: cheaper updates, and it sees",
+            "all four, and 84 x 84 pixels, 255 for white, raw features",
+            "42 x 42, 0 for white, normalised features: cheaper updates, and it sees",
         ),
         "conv_default": (
             "convolutions as PyTorch initialises them",
@@ -147,8 +157,8 @@ RECIPE = {
 RECIPE_NOTE = {
     "gridworld-recipe": "Engineered representation; each row down to the narrow networks keeps "
     "what those above it have undone, and each one below them keeps all of that",
-    "create-recipe": "Learned representation; the second row pays later (2M steps above), and each "
-    "one below it keeps what it has undone",
+    "create-recipe": "Learned representation; each of the last three keeps what the row of the "
+    "84 x 84 pixels has undone",
 }
 
 
