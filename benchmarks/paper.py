@@ -74,8 +74,8 @@ LSTM = f"{NARROW} --hvae-recipe lstm"
 # CREATE's methods are compared with pictures as the paper's policy sees them and what goes with
 # them, and, in rows of their own, with the fast recipe's.
 AS_IS = (
-    "--shrink 1 --no-white-is-zero --no-norm-features --encoder-rate 1 --no-standardize "
-    "--ent-floor 1 --micro-batch 128"
+    "--shrink 1 --no-white-is-zero --no-norm-features --encoder-rate 1 --ent-floor 1 "
+    "--micro-batch 128"
 )
 PICTURES = f"{AS_IS} --clip-coef 0.1"
 MAIN_TASKS = "push obstacle seesaw".split()  # CREATE in the main paper
@@ -133,9 +133,9 @@ RUNS: dict[str, dict[str, str]] = {
     "create-recipe": {
         "fast": "create",
         "clip_0.1": "create --clip-coef 0.1",
+        "clip_0.3": "create --clip-coef 0.3",
         "encoder_rate_1": "create --encoder-rate 1",
-        "not_standardized": "create --no-standardize",
-        "entropy_constant": "create --ent-floor 1",
+        "standardized": "create --standardize",
         "pictures_as_is": f"create {PICTURES}",
         "conv_default": f"create {PICTURES} --conv-gain None",
         "value_coefficient_0.5": f"create {PICTURES} --vf-coef 0.5",

@@ -126,18 +126,15 @@ RECIPE = {
     },
     "create-recipe": {
         "fast": ("none: the fast recipe", ""),
-        "clip_0.1": ("clip 0.1", "0.3: goals are rare, so each one teaches more"),
+        "clip_0.1": ("clip 0.1", "0.2: goals are rare, so each one teaches more"),
+        "clip_0.3": ("clip 0.3", "0.2: else it settles on a few tools too soon"),
         "encoder_rate_1": (
             "convolutions learn as fast as the heads",
             "at 0.3 of the rate: else they learn single pictures by heart",
         ),
-        "not_standardized": (
-            "representations as they come",
-            "mean 0, std 1 over training actions",
-        ),
-        "entropy_constant": ("constant entropy coefficient", "decays to a tenth"),
+        "standardized": ("representations of mean 0, std 1", "as they come"),
         "pictures_as_is": (
-            "all four, and 84 x 84 pixels, 255 for white, raw features",
+            "84 x 84 pixels, 255 for white, raw features; one rate, clip 0.1, constant entropy",
             "42 x 42, 0 for white, normalised features: cheaper updates, and it sees",
         ),
         "conv_default": (
