@@ -326,9 +326,7 @@ FAST = {
         # Our reading: convolutions that can tell 1,024 pictures apart can also learn them by heart
         # in four epochs. The heads need Table 4's rate: what tools are good for is up to them.
         encoder_rate=0.3,
-        # Goals are rare: let each one teach more than at Table 4's 0.1. At 0.3 the policy settles on
-        # a few favourite tools too soon, and seen tools run ahead of unseen ones.
-        clip_coef=0.2,
+        clip_coef=0.2,  # goals are rare: let each one teach more (Table 4: 0.1)
         ent_floor=0.1,  # explore first, commit later: see evaluate --greedy
         micro_batch=256,  # a minibatch at once: with these pictures it fits
         conv_gain=math.sqrt(2),  # PyTorch's own shrinks what differs between two pictures 100 times
