@@ -47,12 +47,7 @@ METHODS = {
     "ours_outcome": "Fast recipe w/o exploring",
     "ours_fast": "Fast recipe",
     "engineered_fast": "Fast recipe, engineered",
-    "oracle_encoder_all_actions_fast": "Fast recipe, oracle encoder",
-    "non_hierarchical_vae_fast": "Fast recipe, VAE",
-    "ours_no_entropy_fast": "Fast recipe w/o entropy",
-    "ours_no_subsampling_fast": "Fast recipe w/o subsampling",
-    "nearest_neighbor_fast": "Fast recipe, nearest neighbour",
-    "continuous_output_fast": "Fast recipe, continuous output",
+    "ours_early": "Fast recipe in a hurry",
     "ours_predicts": "Ours, predicting outcomes",
     "ours_clip": "Ours, clip 0.3",
     "ours_bilinear": "Ours, bilinear utility",
@@ -126,16 +121,9 @@ RECIPE = {
     },
     "create-recipe": {
         "fast": ("none: the fast recipe", ""),
-        "clip_0.1": ("clip 0.1", "0.2: goals are rare, so each one teaches more"),
-        "clip_0.3": ("clip 0.3", "0.2: else it settles on a few tools too soon"),
-        "encoder_rate_1": (
-            "convolutions learn as fast as the heads",
-            "at 0.3 of the rate: else they learn single pictures by heart",
-        ),
-        "standardized": ("representations of mean 0, std 1", "as they come"),
         "pictures_as_is": (
-            "84 x 84 pixels, 255 for white, raw features; one rate, clip 0.1, constant entropy",
-            "42 x 42, 0 for white, normalised features: cheaper updates, and it sees",
+            "84 x 84 pixels, 255 for white, raw features; learning rate 0.001, clip 0.1",
+            "42 x 42, 0 for white, normalised features; 0.0003, 0.2: cheaper updates, and it sees",
         ),
         "conv_default": (
             "convolutions as PyTorch initialises them",
@@ -154,8 +142,8 @@ RECIPE = {
 RECIPE_NOTE = {
     "gridworld-recipe": "Engineered representation; each row down to the narrow networks keeps "
     "what those above it have undone, and each one below them keeps all of that",
-    "create-recipe": "Learned representation; each of the last three keeps what the row of the "
-    "84 x 84 pixels has undone",
+    "create-recipe": "Learned representation; the second row pays later (2M steps above), and each "
+    "one below it keeps what it has undone",
 }
 
 

@@ -802,6 +802,7 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--gamma", "2"], "gamma 2.0 is not in 0..1"),
         (["--max-grad-norm", "0"], "max_grad_norm 0.0 is not above 0"),
         (["--weight-decay", "-1"], "weight_decay -1.0 is not at least 0"),
+        (["--encoder-rate", "0"], "encoder_rate 0.0 is not above 0"),
         (["--modality", "smell"], "modality 'smell' is not one of gridworld's: xy, onehot"),
         (["--eval-available", "300"], "eval_available 300 is not in 1..256"),
         (["--recipe", "paper", "--recipe", "fast"], "may be given only once"),
@@ -1051,6 +1052,16 @@ def test_adaptation_trains_on_the_fixed_test_set_from_scratch_or_from_a_run(
         assert np.array_equal(best["agent"]["train_ids"], test_ids)
         rows = list(csv.DictReader((run / "metrics.csv").open()))
         assert all(r["train_score"] and not r["valid_score"] for r in rows)
+
+
+def test_the_encoder_learns_at_its_own_rate(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", small(tmp_path, "--encoder-rate", "0.5", "--run-name", "run"))
+    ppo.main()
+    checkpoint = ppo.load_checkpoint(tmp_path / "run" / "checkpoint.pt", "cpu")
+    encoder, *others = checkpoint["optimizer"]["param_groups"]
+    own = [name for name in checkpoint["agent"] if name.startswith("encoder.")]
+    assert len(encoder["params"]) == len(own) > 0 and len(others) == 2
+    assert all(encoder["lr"] == 0.5 * group["lr"] > 0 for group in others)
 
 
 def test_finetuning_starts_from_the_weights_of_the_run_and_resets_only_the_discrete_head(
