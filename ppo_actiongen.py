@@ -1634,8 +1634,9 @@ class Run:
         gathered(None)  # the folder is there
         # Python looks for cycles of dead objects again and again, and most of what it looks through
         # are 300,000 objects of libraries that live as long as the program. Frozen, they are
-        # skipped (a fifth of CREATE's rollouts, whose physics makes such cycles). Those of an
-        # earlier run in this process come back first, so that what died of them is cleared away.
+        # skipped: CREATE's rollouts, whose physics makes such cycles, are 1.2 times as fast
+        # (benchmarks/throughput.py image). Those of an earlier run in this process come back
+        # first, so that what died of them is cleared away.
         gc.unfreeze()
         gc.collect()
         gc.freeze()

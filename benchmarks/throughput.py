@@ -8,6 +8,7 @@ group come from one process on one machine, so ratios between its rows can be tr
 machine is slow or shared; absolute rates are this machine's. Nothing here is a timed test.
 """
 
+import gc
 import os
 import sys
 import time
@@ -280,6 +281,16 @@ def image() -> Iterator[Row]:
         learning = steps / (total - acting)
         yield f"{what}: update alone", learning, "steps/s", "-", cpu
         yield f"{what}: end to end", rates[form], "steps/s", "850", cpu + "; aim"
+        if form == "fast":
+            used = {}  # CPU seconds, in turns; Run froze the libraries' objects
+            for thaw in (False, True) * 2:
+                (gc.unfreeze if thaw else gc.freeze)()
+                begin = clock()
+                for _ in range(3):
+                    rollout()
+                used[thaw] = used.get(thaw, 0.0) + clock() - begin
+            ratio = used[True] / used[False]
+            yield "  rollouts: ratio to no frozen objects", ratio, "x", "", "same process"
         run.envs.close()
     fast, large, plain = rates.values()
     yield "  ratio to the plain form, 84 x 84 pixels", large / plain, "x", "", "same process"
