@@ -1087,8 +1087,8 @@ def gae(rewards, values, dones, next_value, gamma, lam):
 
 def explained_variance(values, returns) -> float:
     """1 - Var[return - V] / Var[return] over the rollout: 1 a perfect critic, 0 a useless one."""
-    pair = (x.flatten().cpu().double().numpy() for x in (values, returns))  # 2 x (T*N,)
-    values, returns = (np.concatenate(gathered(x)) for x in pair)
+    pair = np.stack([x.flatten().cpu().double().numpy() for x in (values, returns)])  # (2, T*N)
+    values, returns = np.concatenate(gathered(pair), axis=1)
     spread = returns.var()
     return float(1 - (returns - values).var() / spread) if spread else math.nan
 
@@ -1187,10 +1187,8 @@ def update(agent, optimizer, batch, ent_coef, args: Args, generator, device):
             nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
             optimizer.step()
     count = args.update_epochs * args.num_minibatches
-    return {
-        k: sum(gathered(v.item() / count)) / WORLD_SIZE if WORLD_SIZE > 1 else v.item() / count
-        for k, v in totals.items()
-    }
+    ranks = gathered({k: v.item() / count for k, v in totals.items()})
+    return {k: sum(means[k] for means in ranks) / WORLD_SIZE for k in totals}
 
 
 # ---- Algorithm 2: acting with new actions ----
