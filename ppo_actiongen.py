@@ -176,7 +176,7 @@ class Args:
     encoder_rate: float = 1.0
     """Factor on the learning rate of the state encoder (ours; the paper: 1)."""
     weight_decay: float = 0.0
-    """Decoupled weight decay on the utility's weights (ours; 0 = the paper's)."""
+    """Decoupled weight decay on the utility's weights and biases (ours; 0 = the paper's)."""
     conv_gain: float | None = None
     """Orthogonal gain of the image encoder's convolutions (None: PyTorch's own initialisation)."""
     shrink: Literal[1, 2, 4] = 1
@@ -351,7 +351,7 @@ FAST = {
     ),
 }
 
-# --quick: the fast recipe with a smaller budget; the encoder is hvae.py's quick one.
+# --quick: either recipe with a smaller budget; the encoder is hvae.py's quick one.
 QUICK = {
     "gridworld": dict(total_timesteps=1_500_000, hvae_recipe="quick"),
     "recsys": dict(total_timesteps=1_000_000),
@@ -702,7 +702,8 @@ class Agent(nn.Module):
         why; what it thinks of these actions is free to drift, and with it what it thinks of unseen
         ones, which no experience corrects. PPO learns the mixture, so it stays on-policy;
         evaluation plays pi alone. Actions that only `explore` would choose get hardly any policy
-        gradient; what they teach is their outcome (outcome_loss).
+        gradient; what they teach is their outcome (outcome_loss). The entropy bonus stays pi's: it
+        is pi that should not commit too early, the mixture never does.
         """
         if not self.explore:
             return logp
@@ -732,7 +733,7 @@ class Agent(nn.Module):
         the position also depends on with --aux-conditioned (C.4).
         """
         out, logprob, entropy = {}, 0.0, 0.0
-        stop_code = code
+        stop_code = code  # C.4 conditions the position alone
         if self.has_position:
             if self.aux_conditioned:  # (B, H), (B, H) -> (B, 2H); the utility's own projection
                 code = torch.cat([code, self.action_project(self.table[taken])], dim=1)
@@ -741,13 +742,15 @@ class Agent(nn.Module):
             if action is None:
                 both = torch.stack([alpha, beta], dim=-1)  # (B, d, 2)
                 unit = alpha / (alpha + beta)  # (B, d), the mean
-                if not greedy:  # a Beta is a 2-way Dirichlet
+                if not greedy:  # a Beta is a 2-way Dirichlet; Beta.sample takes no generator
                     unit = torch._sample_dirichlet(both, noise)[..., 0]
                 out["position"] = 2 * unit - 1  # (B, d) in [-1, 1]
             else:
                 out["position"] = action["position"]
             dist = torch.distributions.Beta(alpha, beta, validate_args=False)
-            # float32 can round to the border, where the density may be zero or infinite.
+            # The density is that of [0, 1]; that of [-1, 1] is half of it per dimension, a constant
+            # that PPO's ratio of two densities does not see. float32 can round to the border, where
+            # the density may be zero or infinite.
             unit = (0.5 + out["position"] / 2).clamp(1e-6, 1 - 1e-6)
             logprob = logprob + dist.log_prob(unit).sum(1)
             entropy = entropy + self.aux_ent_scale * dist.entropy().sum(1)
@@ -1167,7 +1170,7 @@ def update(agent, optimizer, batch, ent_coef, args: Args, generator, device):
     totals: dict[str, torch.Tensor] = {}
     for _ in range(args.update_epochs):
         permutation = torch.randperm(len(adv), generator=generator, device=device)
-        for start in range(0, size * args.num_minibatches, size):  # a rest is dropped
+        for start in range(0, len(adv), size):
             optimizer.zero_grad()
             # The parameters changed, so the table is projected again: (n, W), cheap. Its gradient
             # is collected in a leaf and goes through the projection once, after all micro-batches.
@@ -1207,7 +1210,7 @@ def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=
     num_envs = min(episodes, 40 if episodes >= 1000 else 32)  # published: 40 x 125, 32 x 20
     num_envs = -(-num_envs // WORLD_SIZE)  # torchrun: each process plays its part
     episodes = episodes // WORLD_SIZE + (RANK < episodes % WORLD_SIZE)
-    seed += RANK * num_envs  # environment i of them all starts from seed + i
+    seed += RANK * num_envs  # CREATE, Stacking: environment i of them all starts from seed + i
     quota = np.full(num_envs, episodes // num_envs)
     quota[: episodes % num_envs] += 1
     device = agent.table.device
@@ -1259,7 +1262,16 @@ def write_atomically(path: Path, write) -> None:
 
 
 def method_name(args: Args) -> str:
-    """The method's name in results/published_results.csv, so that the two files join."""
+    """The method's name in results/published_results.csv, so that the two files join.
+
+    What the paper does not have gets a name of its own: _bilinear, ours_<name of an .npz file>.
+    """
+    plain = args.method != "utility" or args.utility == "mlp"
+    return utility_name(args) + ("" if plain else "_bilinear")
+
+
+def utility_name(args: Args) -> str:
+    """`method_name`, whatever the form of the utility."""
     if args.adapt:
         policy = "ours" if args.method == "utility" else "discrete"
         return f"{policy}_finetuned" if args.finetune else f"{policy}_from_scratch"
@@ -1273,16 +1285,19 @@ def method_name(args: Args) -> str:
     names = {"hvae-all": "oracle_encoder_all_actions", "vae": "non_hierarchical_vae"}
     if args.representation in names:
         return names[args.representation]
+    if args.representation.endswith(".npz"):
+        return f"ours_{Path(args.representation).stem}"
     if args.representation.startswith("engineered") and args.env != "recsys":
         return args.representation.replace("-", "_")
-    modality_is_default = args.modality is None or (
-        args.modality == importlib.import_module(MODULES[args.env]).MODALITIES[0]
-    )
-    if args.utility == "bilinear":
-        return "ours_bilinear"  # beyond the paper
-    if not modality_is_default:
+    if args.utility == "mlp" and not modality_is_default(args):
         return "ours_video" if args.modality == "video" else "ours_alternate_modality"
     return next(iter(variants(args)), "ours")
+
+
+def modality_is_default(args: Args) -> bool:
+    """Whether the encoder sees what the environment's first modality shows."""
+    first = importlib.import_module(MODULES[args.env]).MODALITIES[:1]
+    return args.modality is None or [args.modality] == [*first]
 
 
 def variants(args: Args) -> list[str]:
@@ -1312,9 +1327,9 @@ def published_scores(args: Args) -> dict[str, float]:
     if variants(args) not in ([], [method]) or args.split not in ("default", "full"):
         return {}
     # So were the baselines, the ablations and the other representations: no two of them at once.
-    usual = PRESETS[args.env].representation == args.representation and args.modality is None
+    usual = PRESETS[args.env].representation == args.representation
     apart = [args.method != "utility", not args.subsample, args.ent_coef == 0, not usual]
-    if sum(apart) > 1:
+    if sum([*apart, not modality_is_default(args)]) > 1:
         return {}
     if path.exists():
         for row in csv.DictReader(path.open()):
@@ -1405,11 +1420,14 @@ def plot_curve(metrics: Path, path: Path, metric: str, published: dict, ceiling)
 
 @torch.no_grad()
 def record_episode(agent, preprocess, args: Args, pool, path: Path) -> None:
-    """Play with unseen actions and save an episode as a GIF: the best of 20, by return."""
+    """Play with unseen actions and save an episode as a GIF: the best of 20, by return.
+
+    After adaptation all of them are on offer, as in training.
+    """
     module = importlib.import_module(MODULES[args.env])
     names = {"gridworld": "GridWorldEnv", "recsys": "RecSysEnv"}
     make = getattr(module, names.get(args.env, args.env.capitalize() + "Env"))
-    K = min(args.eval_available or args.num_available, len(pool))
+    K = len(pool) if args.adapt else min(args.eval_available or args.num_available, len(pool))
     env = make(pool, K, render_mode="rgb_array", **task_options(args))
     device, P = agent.table.device, agent.project_actions()
     generator = torch.Generator(device).manual_seed(args.seed)
@@ -1473,8 +1491,9 @@ def check(args: Args) -> None:
             f"num_envs {args.num_envs} and minibatch_size {args.minibatch_size} must be multiples "
             f"of torchrun's {WORLD_SIZE} processes"
         )
-    if args.micro_batch < 0:
-        raise ValueError(f"micro_batch {args.micro_batch} is not allowed; at least 0")
+    for name in ("micro_batch", "seed", "split_seed", "hvae_seed"):
+        if getattr(args, name) < 0:
+            raise ValueError(f"{name} {getattr(args, name)} is not allowed; at least 0")
     for name, value in vars(args).items():
         values = value if isinstance(value, tuple) else (value,)
         if any(isinstance(v, float) and not math.isfinite(v) for v in values):
@@ -1544,10 +1563,10 @@ def open_run(args: Args, device) -> tuple[Path, dict | None]:
         if (ranks := checkpoint["generator"].shape[0]) != WORLD_SIZE:
             raise ValueError(f"cannot resume {folder}: {ranks} processes there, {WORLD_SIZE} here")
         return folder, checkpoint
-    if folder.exists() and any(folder.iterdir()) and not args.resume and not RANK:
+    if folder.exists() and any(folder.iterdir()) and not RANK:
         if args.overwrite and not (folder / "args.json").exists():
             raise ValueError(f"{folder} is not a run's folder: --overwrite leaves it alone")
-        if not args.overwrite:
+        if not args.overwrite and not args.resume:
             raise ValueError(
                 f"{folder} already holds a run; --resume goes on with it, --overwrite replaces it"
             )
@@ -1586,14 +1605,18 @@ class Run:
             ("cuda" if has_cuda else "cpu") if args.device == "auto" else args.device
         )
         if WORLD_SIZE > 1 and self.device.type == "cuda":  # one GPU for each process
+            if (count := torch.cuda.device_count()) <= int(os.environ["LOCAL_RANK"]):
+                raise ValueError(f"torchrun has more processes than GPUs ({count}); --device cpu")
             self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
             torch.cuda.set_device(self.device)
         self.pools, self.pool, self.num_available = action_pools(args)
         if args.finetune is not None and not args.resume:  # `build` reads it; here: is it there?
             load_checkpoint(Path(args.finetune) / "best.pt", "cpu")
-        K, least = args.eval_available, min(map(len, self.pools.values()))
-        if K is not None and not args.adapt and not 1 <= K <= least:
-            raise ValueError(f"eval_available {K} is not in 1..{least}, the smallest pool's size")
+        name = "num_available" if args.eval_available is None else "eval_available"
+        K, least = getattr(args, name), min(map(len, self.pools.values()))
+        if not args.adapt and K > least:
+            why = "the smallest pool's size; --eval-available is the number on offer at the tests"
+            raise ValueError(f"{name} {K} is not in 1..{least}, {why}")
         self.batch_size = args.minibatch_size * args.num_minibatches  # T * N
         self.num_steps = self.batch_size // args.num_envs  # T
         self.num_updates = args.total_timesteps // self.batch_size
@@ -1691,17 +1714,25 @@ class Run:
 
         The discrete policy's outputs are training actions, so that head starts anew, and with it
         the stop head (published code). The statistics of the states stand still from here on.
-        Raises ValueError when the run was trained with other networks or another table.
+        The running scale of the rewards starts anew too (silent in paper and code).
+        Raises ValueError when the run was trained with other networks, another table, another split
+        (what is new here may not have been new there) or states that enter the networks otherwise.
         """
         best = load_checkpoint(folder / "best.pt", self.device)
+        same = "split split_seed fully_observable placement norm_obs one_hot shrink white_is_zero"
+        for name, there, here in difference(self.args, best["args"]):
+            if name in f"{same} norm_features".split():
+                problem = f"{name} is {there!r} there, {here!r} here"
+                raise ValueError(f"cannot fine-tune {folder}: {problem}")
         theirs, own = best["agent"], self.agent.state_dict()
         discrete = self.args.method == "nearest-neighbor"
         anew = ("train_ids", "head.", "fc_stop.") if discrete else ("train_ids",)
-        for name in set(own) | set(theirs):
+        for name in sorted(set(own) | set(theirs)):
+            missing = name not in own or name not in theirs
+            if missing or (own[name].shape != theirs[name].shape and not name.startswith(anew)):
+                raise ValueError(f"cannot fine-tune {folder}: its networks differ ({name})")
             if name.startswith(anew):
                 theirs[name] = own[name]
-            elif name not in own or name not in theirs or own[name].shape != theirs[name].shape:
-                raise ValueError(f"cannot fine-tune {folder}: its networks differ ({name})")
         if not torch.equal(theirs["table"], own["table"]):
             raise ValueError(f"cannot fine-tune {folder}: its representations are other ones")
         self.agent.load_state_dict(theirs)
@@ -1797,6 +1828,11 @@ def train(args: Args) -> dict:
         # Learn, then let the normaliser catch up with what was seen.
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
         losses = update(run.agent, run.optimizer, batch, ent_coef, args, run.generator, run.device)
+        if not all(map(math.isfinite, losses.values())):
+            raise ValueError(
+                f"after {run.update_index * run.batch_size} steps the loss is no number any more; "
+                f"learning_rate {args.learning_rate} is too high for these settings"
+            )
         if run.preprocess.normalizes and not args.finetune:
             raw = batch["raw"].flatten(0, 1).numpy()  # (T*N, ...)
             run.preprocess.stats.update(np.concatenate(gathered(raw)))
@@ -1862,10 +1898,12 @@ def finish(run: Run) -> dict:
         return results
     launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
     seen, unseen = CEILINGS.get(experiment_name(args), (None, None))
+    K = args.eval_available or args.num_available
     if args.env == "recsys":  # its ceilings are those of 500 products on offer
-        K = args.eval_available or args.num_available
         unseen = unseen if K == 500 else None
         seen = seen if K == 500 and run.num_available < len(run.pool) else None
+    if args.env == "gridworld" and K < 50:  # and that of 50 skills; more only help
+        seen, unseen = seen if run.num_available == len(run.pool) else None, None
     results |= {
         "metric": run.module.METRIC,
         "method": method_name(args),
@@ -1900,7 +1938,7 @@ class EvaluateArgs:
     actions: Literal["train", "valid", "test"] = "test"
     """Which actions are on offer."""
     num_available: int | None = None
-    """K (default: that of the scores in the run's results.json)."""
+    """K (default: that of the run's own tests)."""
     episodes: int = 5000
     """Episodes to play."""
     seed: int = 0
@@ -1989,8 +2027,11 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     K = options.num_available
     if K is None:
         K = len(pool) if whole else args.eval_available or args.num_available
-    if not 1 <= K <= len(pool) or options.episodes < 1:
-        raise ValueError(f"num_available {K} is not in 1..{len(pool)}, or episodes is below 1")
+    if options.episodes < 1:
+        raise ValueError(f"episodes {options.episodes} is not allowed; at least 1")
+    if not 1 <= K <= len(pool):
+        left = f"the {len(pool)} of the {options.actions} actions that these options leave"
+        raise ValueError(f"num_available {K} is not in 1..{len(pool)}, {left}")
     envs = make_envs(args, pool, 1, K, 0)
     spaces = envs.single_observation_space, envs.single_action_space
     preprocess = Preprocess(spaces[0]["state"], args, checkpoint["preprocess"]["ids"].numpy())
@@ -2025,7 +2066,11 @@ def default_args(env: str, recipe: str, quick: bool) -> Args:
     args = replace(PRESETS[env], recipe=recipe, quick=quick)
     if recipe == "fast":
         args = replace(args, **FAST.get(env, {}))
-    return replace(args, **QUICK.get(env, {})) if quick else args
+    if quick:
+        args = replace(args, **QUICK[env])
+    if quick and recipe == "paper":  # evaluates too seldom for a short run to choose a checkpoint
+        args = replace(args, eval_every=min(args.eval_every, args.total_timesteps // 4))
+    return args
 
 
 def main() -> None:

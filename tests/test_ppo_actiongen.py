@@ -793,6 +793,12 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--placement", "1d"], "placement"),
         (["--minibatch-size", "7"], "multiple of num_envs"),
         (["--micro-batch", "-1"], "micro_batch -1"),
+        (["--seed", "-1"], "seed -1 is not allowed"),
+        (["--split-seed", "-1"], "split_seed -1 is not allowed"),
+        (
+            ["--num-available", "300", "--eval-available", "None"],
+            "num_available 300 is not in 1..2",
+        ),
         (["--utility-hidden", "-1"], "utility_hidden -1"),
         (["--eval-available", "0"], "eval_available 0"),
         (["--lr-decay-steps", "0"], "lr_decay_steps 0"),
@@ -854,8 +860,8 @@ def test_a_refused_overwrite_leaves_the_old_run(finished, monkeypatch):
 def test_overwrite_throws_away_runs_only(tmp_path, monkeypatch):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.txt").write_text("three years")
-    for name in ("thesis", "."):
-        words = ["--overwrite", "--run-name", name]
+    for name, more in (("thesis", []), (".", []), ("thesis", ["--resume"]), (".", ["--resume"])):
+        words = ["--overwrite", "--run-name", name, *more]
         monkeypatch.setattr(sys, "argv", command(tmp_path, *words, steps=768)[1:])
         with pytest.raises(SystemExit, match="is not a run's folder: --overwrite leaves it alone"):
             ppo.main()
@@ -925,6 +931,40 @@ def test_published_numbers_stand_only_beside_what_was_published():
         usual = replace(ppo.default_args("gridworld", "fast", False), **changes)
         assert ppo.published_scores(usual)
         assert not ppo.published_scores(replace(usual, representation="engineered"))
+    # ... and nothing with somebody's own table, nor an oracle of another modality.
+    for changes in (
+        dict(representation="mine.npz"),
+        dict(representation="hvae-all", modality="xy"),
+    ):
+        usual = replace(ppo.default_args("gridworld", "fast", False), **changes)
+        assert bool(ppo.published_scores(usual)) == (usual.modality == "xy")
+    assert not ppo.published_scores(replace(usual, modality="onehot"))
+
+
+def test_names_tell_runs_apart():
+    """Two runs that differ in what they are do not share a name, and so a folder."""
+
+    def name(env, **changes):
+        return ppo.method_name(replace(ppo.default_args(env, "fast", False), **changes))
+
+    ablations = dict(), dict(ent_coef=0.0), dict(subsample=False)
+    assert [name("recsys", **c) for c in ablations] == [
+        *("ours_bilinear", "ours_no_entropy_bilinear", "ours_no_subsampling_bilinear")
+    ]
+    assert name("recsys", ent_coef=0.0, utility="mlp") == "ours_no_entropy"
+    assert name("recsys", method="nearest-neighbor") == "nearest_neighbor"
+    assert name("gridworld", representation="a/mine.npz") == "ours_mine"
+    assert name("gridworld", representation="vae", utility="bilinear").startswith("non_hier")
+    assert name("create", modality="video") == "ours_video"
+    assert name("create", modality="xy") == name("create") == "ours"
+
+
+def test_quick_paper_recipe_chooses_among_checkpoints():
+    for env in ppo.PRESETS:
+        args = ppo.default_args(env, "paper", True)
+        updates = args.total_timesteps // (args.minibatch_size * args.num_minibatches)
+        between = args.eval_every // (args.minibatch_size * args.num_minibatches)
+        assert updates // max(1, between) >= 3, env
 
 
 def test_unknown_environment_and_recipe(monkeypatch):
@@ -1105,16 +1145,40 @@ def test_adaptation_refuses_with_one_line_and_leaves_nothing(tmp_path, extra, wo
     assert not any(tmp_path.iterdir())
 
 
-def test_finetuning_refuses_another_policy_or_table(tmp_path, monkeypatch):
+def test_finetuning_refuses_another_policy_table_split_or_state(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", small(tmp_path))
     ppo.main()
     run = str(tmp_path / "gridworld-engineered-s0")
-    other = ["--representation", "engineered-5d"], ["--method", "nearest-neighbor"]
-    for extra in other:
+    other = {
+        "its networks differ": ["--representation", "engineered-5d"],
+        r"its networks differ \(action_project.bias": ["--method", "nearest-neighbor"],
+        "split_seed is 0 there, 1 here": ["--split-seed", "1"],
+        "one_hot is True there, False here": ["--no-one-hot"],
+    }
+    for words, extra in other.items():
         monkeypatch.setattr(sys, "argv", small(tmp_path, *extra, "--finetune", run))
-        with pytest.raises(SystemExit, match="cannot fine-tune"):
+        with pytest.raises(SystemExit, match=f"cannot fine-tune .*: {words}"):
             ppo.main()
     assert [p.name for p in tmp_path.iterdir()] == ["gridworld-engineered-s0"]
+
+
+def test_a_run_that_diverges_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", small(tmp_path, "--learning-rate", "1e6"))
+    with pytest.raises(SystemExit, match="learning_rate 1000000.0 is too high") as e:
+        ppo.main()
+    assert "\n" not in str(e.value)
+
+
+def test_ceiling_of_fewer_skills_is_not_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", small(tmp_path, "--eval-available", "5"))
+    ppo.main()
+    results = json.loads((tmp_path / "gridworld-engineered-s0" / "results.json").read_text())
+    assert results["ceiling"] == {"train": None, "valid": None, "test": None}
+    monkeypatch.setattr(
+        sys, "argv", ["ppo", "evaluate", str(tmp_path / "gridworld-engineered-s0"), "--episodes=0"]
+    )
+    with pytest.raises(SystemExit, match="episodes 0 is not allowed"):
+        ppo.main()
 
 
 def test_pools_of_the_analyses():
