@@ -64,7 +64,7 @@ NUM_AVAILABLE = 20  # Table 3 "actions per episode"
 LAMBDA_TOP = LAMBDA_AVG = 0.5  # Eq. 4
 FRAMES = 4  # A.4 "stack past 4 frames"
 SIZE = 84  # A.4 "84x84 grayscale image"
-DROP_GAP = 0.02  # ours: a soft drop (A.4) from a visible gap of 2 cm; shapes are 16 to 192 wide
+DROP_GAP = 0.02  # ours: a soft drop (A.4) from a gap of 2 cm; shapes are 16 to 192 wide
 CYLINDERS = (798, 799, 800)  # published code: the start cylinders are two copies of one of these
 CENTRE, AXIS_GAP = (-0.2, 0.2), (1.0, 1.6)  # published code: "random locations on a line" (A.4)
 
@@ -91,7 +91,9 @@ REST_DEPTH = 0.01  # ours: at rest, two bodies overlap by less; an eighth of the
 
 # ---- pictures ----
 FOV = 45.0  # published code, degrees
-FRONT = (0.0, -7.0, 2.5), (0.0, 0.0, 2.5)  # published code: eye and target; right = +x, floor z = 0
+# published code: eye and target; right = +x, floor z = 0. The picture ends at a height of 5.4 (2D
+# Place: 3.9), so that the policy does not see the top of its best towers.
+FRONT = (0.0, -7.0, 2.5), (0.0, 0.0, 2.5)
 RAISED = (0.0, -4.0, 5.5), (0.0, 1.66, 0.0)  # the same for 2D Place
 VIEW_RADIUS, VIEW_HEIGHT = 2.0, (0.5, 2.0)  # published code: a circle around the shape, and heights
 SUN = (0.24, -0.82, 0.52)  # ours: direction to the light, of length 1
@@ -430,8 +432,10 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         420 / 195 / 195 for "full".
 
     Raises:
-        ValueError: another split name.
+        ValueError: another split name, or a negative seed.
     """
+    if seed < 0:
+        raise ValueError(f"seed must be >= 0, got {seed}")
     rng = np.random.default_rng(seed)
     if split == "default":
         keep = []
@@ -656,15 +660,15 @@ def action_observations(
         (len(action_ids), num_observations, 84, 84) uint8.
 
     Raises:
-        ValueError: unknown id or modality, or a number below 1.
+        ValueError: unknown id or modality, a number below 1, or a negative seed.
     """
     ids = check_ids(action_ids)
     if modality not in MODALITIES:
         raise ValueError(f"unknown modality {modality!r}; allowed: {', '.join(MODALITIES)}")
-    if num_observations < 1 or workers < 1:
-        raise ValueError(
-            f"num_observations and workers must be >= 1, got {num_observations} and {workers}"
-        )
+    limits = (("num_observations", num_observations, 1), ("workers", workers, 1), ("seed", seed, 0))
+    for name, value, least in limits:
+        if not isinstance(value, int | np.integer) or value < least:
+            raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
     shape = (len(ids), num_observations, SIZE, SIZE)
     if cache_dir is None or len(ids) * num_observations < CACHE_FROM:
         out = np.empty(shape, dtype=np.uint8)
@@ -901,6 +905,7 @@ class StackingEnv(gym.Env):
             solverResidualThreshold=SOLVER_RESIDUAL, deterministicOverlappingPairs=1,
             physicsClientId=client,
         )  # fmt: skip
+        # The floor has no end (published code: invisible walls at the left and at the back).
         plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)
         floor = p.createMultiBody(0, plane, useMaximalCoordinates=1, physicsClientId=client)
         p.changeDynamics(floor, -1, **FRICTION, restitution=0, physicsClientId=client)
@@ -1075,10 +1080,10 @@ def make_vec(
             processes from two environments on (a step costs 100 times more than its messages).
 
     Raises:
-        ValueError: num_envs below 1, or a bad argument of StackingEnv.
+        ValueError: num_envs below 1, a negative seed, or a bad argument of StackingEnv.
     """
-    if num_envs < 1:
-        raise ValueError(f"num_envs must be >= 1, got {num_envs}")
+    if num_envs < 1 or seed < 0:
+        raise ValueError(f"num_envs must be >= 1 and seed >= 0, got {num_envs}, {seed}")
     StackingEnv(action_pool, num_available, **task)  # bad arguments fail here, not in a worker
     _load_pybullet()  # once, before the workers are forked
 

@@ -47,6 +47,7 @@ METHODS = {
     "ours_outcome": "Fast recipe w/o exploring",
     "ours_fast": "Fast recipe",
     "engineered_fast": "Fast recipe, engineered",
+    "ours_paper_recipe": "Paper's recipe",
     "ours_early": "Fast recipe in a hurry",
     "ours_predicts": "Ours, predicting outcomes",
     "ours_clip": "Ours, clip 0.3",

@@ -68,6 +68,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_predicts",
             "ours_clip",
             "ours_fast",
+            "ours_paper_recipe",
             "engineered_fast",
             "ours_early",
             "ours_analysis",

@@ -256,6 +256,42 @@ def test_bucket_holds_a_ball_for_good(radius):
     assert ball.body.velocity.length < 0.1
 
 
+@pytest.mark.parametrize(
+    "other, x, y",
+    [(Tool("Funnel", size=11), 42.0, 34.0), (Tool("Cannon", angle=270, force=100.0), 38.0, 34.0)],
+)
+def test_what_a_bucket_holds_stays_there_whatever_else_touches_it(other, x, y):
+    space, _, ball = drop(other, (42.2, 52.0), at=(x, y))
+    bucket = c.build(Tool("Bucket", angle=0, size=3), 42.0, 42.0, space.static_body)
+    space.add(*bucket.parts)
+    for _ in range(400):
+        space.step(c.DT)
+    assert ball.holder is bucket
+    assert tuple(ball.body.position) == pytest.approx((42.0, 42.0), abs=0.1)
+
+
+@pytest.mark.parametrize("task", c.TASKS)
+def test_steps_straight_into_the_library_are_the_same_steps(task, monkeypatch):
+    """`advance` against a loop of Space.step: same pictures, rewards and ends."""
+
+    def play():
+        env, seen = CreateEnv(num_available=60, task=task), []
+        obs, _ = env.reset(seed=3)
+        rng = np.random.default_rng(0)
+        for _ in range(40):
+            action = {"choice": int(rng.integers(60)), "position": rng.uniform(-1, 1, 2)}
+            obs, reward, terminated, truncated, _ = env.step(action)
+            seen.append((obs["state"].tobytes(), reward, terminated, truncated))
+            if terminated or truncated:
+                env.reset()
+        return seen
+
+    direct = play()
+    assert c.chipmunk is not None  # else this test compares nothing
+    monkeypatch.setattr(c, "chipmunk", None)
+    assert play() == direct
+
+
 @pytest.mark.parametrize("kind", ["Hinged See-saw", "See-saw"])
 def test_see_saws_keep_their_limit_and_their_centre(kind):
     rng = np.random.default_rng(0)
@@ -940,8 +976,17 @@ def test_cache_gives_the_same_bytes_and_grows(tmp_path, monkeypatch):
     with np.load(path, allow_pickle=False) as stored:
         assert stored["ids"].tolist() == [3, 8, 20]
     assert np.array_equal(both[0], first[1])
-    monkeypatch.setattr(c, "_probe_states", None)  # found again, not computed again
+    work = c._probe_states
+
+    def signature_only(job):
+        assert job[1:] == (4, 0), "found again, not computed again"
+        return work(job)
+
+    monkeypatch.setattr(c, "_probe_states", signature_only)
     assert np.array_equal(c.action_observations([20, 3], 10, cache=tmp_path)[1], first[0])
+    monkeypatch.setitem(c.FIRST_CORNER, "Funnel", 90)  # other physics: nothing to be found
+    with pytest.raises(AssertionError, match="not computed again"):
+        c.action_observations([20, 3], 10, cache=tmp_path)
 
 
 def test_probe_video():

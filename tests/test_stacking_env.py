@@ -308,7 +308,16 @@ def test_large_requests_are_cached_and_the_cache_is_safe(tmp_path, monkeypatch):
     assert len(list(tmp_path.iterdir())) == 1  # nothing half-written stays
 
 
-@pytest.mark.parametrize("bad", [{"modality": "video"}, {"num_observations": 0}, {"workers": 0}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"modality": "video"},
+        {"num_observations": 0},
+        {"workers": 0},
+        {"seed": -1},
+        {"workers": 1.5},
+    ],
+)
 def test_bad_requests_for_observations_are_refused(bad):
     with pytest.raises(ValueError, match=str(next(iter(bad.values())))):
         action_observations(**({"action_ids": [1], "num_observations": 2} | bad))
