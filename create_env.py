@@ -1662,24 +1662,30 @@ def _reader(space: pymunk.Space, bodies: list) -> "partial":
 
 
 def _probe_video(job: tuple[int, np.ndarray]) -> np.ndarray:
-    """Pictures of one tool's trajectories, uint8 (n, 7, 48, 48), from its states (n, 7, 7)."""
+    """Pictures of one tool's trajectories, uint8 (n, 7, 48, 48), from its states (n, 7, 7).
+
+    The camera stands over the tool. appendix: silent; published code: over the scene, with the tool
+    anywhere in it. Where a tool was put says nothing about what it does, and there is nothing else
+    in the scene, so that it can move along.
+    """
     action, states = job
     tool, static_body = TOOLS[action], pymunk.Space().static_body
     ball = build(PROBE_BALL, 0.0, 0.0, static_body)
     video = np.empty((*states.shape[:2], PROBE_VIDEO, PROBE_VIDEO), np.uint8)
+    scene = np.full((PROBE_VIDEO, PROBE_VIDEO), 255.0, np.float32)
+    thing = None
+    if tool.kind != "No-op":
+        thing = build(tool, *to_units(np.zeros(2)), static_body)
+        if thing.body is None:
+            paint(scene, grey_strokes(thing))
     for trajectory, pictures in zip(states.astype(np.float64), video, strict=True):
-        scene = np.full((PROBE_VIDEO, PROBE_VIDEO), 255.0, np.float32)
-        thing = None
-        if tool.kind != "No-op":
-            thing = build(tool, *(to_units(trajectory[0, :2])), static_body)
-            if thing.body is None:
-                paint(scene, grey_strokes(thing))
+        camera = trajectory[0, :2]
         for state, picture in zip(trajectory, pictures, strict=True):
             canvas = scene.copy()
             if thing is not None and thing.body is not None:
                 thing.body.angle = state[6]
                 paint(canvas, grey_strokes(thing))
-            ball.body.position = tuple(to_units(state[2:4]).tolist())
+            ball.body.position = tuple(to_units(state[2:4] - camera).tolist())
             paint(canvas, grey_strokes(ball))
             picture[:] = canvas + 0.5
     return video

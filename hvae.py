@@ -68,6 +68,7 @@ CLASSES = 80  # B: "two 80-dimensional one-hot vectors" for the 80x80 grid
 CONV_FEATURES = 32 * 3 * 3  # published code: channels * height * width after the last convolution
 LOG_VAR_RANGE = (-4.0, 3.0)  # published code: clamp of the decoder's log-variance
 BN_EPS, BN_MOMENTUM = 1e-3, 0.01  # published code: batch norm of latents
+COARSE = 4  # ours: pixels a side of what the linear path sees of a video
 NETWORK_SHARE = 0.1  # ours: of the networks in c when there is a linear path
 GRADIENT_CLIP = 0.5  # published code: every entry of a gradient is cut to [-0.5, 0.5]
 PERPLEXITY = 10  # published code: t-SNE
@@ -90,8 +91,8 @@ class Args:
     split: str = "default"  # split of the actions: default, full, ...
     split_seed: int = 0  # seed of the split
     seed: int = 0  # seed of weights, batches and latent samples
-    # paper: Tables 3-4; quick: a minute or two; Grid World in minutes with D.3.1's encoder: lstm,
-    # with all moves at once: mlp
+    # paper: Tables 3-4; quick: a minute or two (Grid World's laptop table takes no longer anyway);
+    # Grid World in minutes with D.3.1's encoder: lstm, with all moves at once: mlp
     recipe: Literal["laptop", "quick", "lstm", "mlp", "paper"] = "laptop"
     device: str = "auto"  # cpu, cuda, or auto
     runs_dir: str = "runs"  # results go to <runs_dir>/hvae
@@ -130,8 +131,9 @@ TABLE_3 = {
 TABLE_4 = dict(learning_rate=1e-3, observations=1024, q_hidden=128, hidden=64)
 VISUAL = dict(batch_size=32, epochs=5_000, hidden=128)  # published code, for CREATE video too
 
-# Every way in which the short recipes leave the paper. Each line stands alone: what it is worth can
-# be seen by switching it back on the command line (only decoder_log_var has no such word).
+# How recipe `lstm` leaves the paper. Each line stands alone: what it is worth can be seen by
+# switching it back on the command line (only decoder_log_var has no such word). Further down is
+# what the other short recipes have otherwise.
 RECIPES = {
     "paper": dict(  # 128 x 1,024 trajectories in one update take 11 GB of memory
         batch_observations=1024,
@@ -152,8 +154,9 @@ RECIPES = {
         batch_observations=4,
         # A representation is pooled over a set of 64 observations: enough to average out starts.
         table_observations=64,
-        # Each update sees 4 of that set, so each bears 1/64 of the price of c, as in the ELBO of
-        # the whole set. At 1/4, c kept only 4 of its 16 dimensions in use.
+        # Each update sees 4 of that set, and each bears 1/64 of KL(q(c|X)), as if X were all 64:
+        # |X| of the ELBO above. Not quite the ELBO: c comes from the 4 alone, which it then has to
+        # explain. At 1/4, c kept only 4 of its 16 dimensions in use.
         set_size=64,
         # A free log-variance moves by about lr per update: 10,000 updates from its start to -9.
         log_var_lr=10.0,
@@ -162,13 +165,13 @@ RECIPES = {
         # Two halves of 32, concatenated, are also D.3.1's "64-dimensional encoded vector", with a
         # quarter of the weights of two averaged 64s.
         compact=True,
-        kl_warmup=0.0,  # cells are few and sure: z is learned without a head start
+        kl_warmup=0.0,  # cells are few and sure: the Bi-LSTM needs no head start for z
         updates=2_750,
     ),
 }
 RECIPES["lstm"] = RECIPES["laptop"]  # to this the rows of SPECIAL do not apply: D.3.1's Bi-LSTM
 # ours: an update with the MLP encoder takes two thirds of the time of one with the Bi-LSTM.
-RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=1_500)
+RECIPES["quick"] = RECIPES["laptop"] | dict(encoder="mlp", updates=1_500)  # own environments
 
 CREATE = dict(
     # Balls meet a tool in many ways: more observations in an update say more about it.
@@ -190,6 +193,10 @@ PICTURES = dict(  # what holds for CREATE's trajectories holds for them
     kl_warmup=0.5,
     learning_rate=2e-3,
 )
+
+# Ours. In the time there is, networks learn where the ball no longer is, not where it goes, and
+# need no c for that: a linear map of the averaged frames says more about a tool they have not seen.
+VIDEO = dict(batch_size=16, batch_observations=4, linear_path=True)
 
 # Ours. Where a skill ends is learned early; in which order it moves takes thousands of updates
 # more, and the MLP encoder (beyond the paper), which has all moves before it at once, makes 1.4
@@ -214,8 +221,8 @@ SPECIAL = {  # recipe and environment or modality -> what else is different ther
     # Pictures cost a hundred times as much as grid trajectories.
     "laptop image": PICTURES | dict(updates=1_500),
     "quick image": PICTURES | dict(updates=1_000),
-    "laptop video": dict(observations=32, batch_observations=4, updates=1_000),
-    "quick video": dict(observations=16, batch_observations=2, updates=200),
+    "laptop video": VIDEO | dict(observations=32, updates=1_500),
+    "quick video": VIDEO | dict(observations=16, updates=200),
 }
 
 
@@ -246,14 +253,18 @@ def resolve(args: Args) -> Args:
             raise ValueError(
                 f"unknown {name} {value!r} for {args.env}; allowed: {', '.join(allowed)}"
             )
+    if modality not in KINDS:  # of an environment that is not ours
+        raise ValueError(f"modality {modality!r} has no network here; known: {', '.join(KINDS)}")
     preset = TABLE_4 | TABLE_3.get(args.env, TABLE_3["gridworld"])
     preset |= VISUAL if KINDS[modality] in ("image", "video") else {}
     preset |= RECIPES[args.recipe]
     for special in (f"{args.recipe} {args.env}", f"{args.recipe} {modality}"):
         preset |= SPECIAL.get(special, {})
-    if preset.get("linear_path") and not args.hierarchical:  # no c, no path to it: learn longer
-        preset |= dict(linear_path=False, updates=RECIPES["mlp"]["updates"])
-    if args.epochs and args.updates and args.epochs != preset["epochs"]:
+    if preset.get("linear_path") and not args.hierarchical:  # no c, no path to it
+        preset |= dict(linear_path=False)
+        if modality != "video":  # ... so learn longer
+            preset |= dict(updates=RECIPES["mlp"]["updates"])
+    if args.epochs and args.updates:
         raise ValueError("epochs and updates: give one of them")
     if args.epochs and not args.updates:
         preset.pop("updates", None)  # asked for in epochs: the recipe's number steps back
@@ -270,6 +281,11 @@ def resolve(args: Args) -> Args:
     for name in ("learning_rate", "log_var_lr"):
         if not 0 < getattr(args, name) < np.inf:
             raise ValueError(f"{name} must be a positive number, got {getattr(args, name)}")
+    low, high = LOG_VAR_RANGE
+    if args.decoder_log_var is not None and not low <= args.decoder_log_var <= high:
+        raise ValueError(  # outside, the clamp lets no gradient through: it would stay there
+            f"decoder_log_var must be between {low:g} and {high:g}, got {args.decoder_log_var}"
+        )
     picture, flat = KINDS[modality] == "image", KINDS[modality] in ("image", "video")
     for name, unused in dict(
         q_hidden=not args.hierarchical,
@@ -287,13 +303,19 @@ def resolve(args: Args) -> Args:
     lstm = args.encoder == "lstm" and KINDS[modality] != "image"
     if args.compact and lstm and args.hidden % 2:
         raise ValueError(f"hidden {args.hidden}: the Bi-LSTM has two halves, so it must be even")
-    if args.linear_path and KINDS[modality] in ("image", "video"):
+    if args.linear_path and KINDS[modality] == "image":
         raise ValueError(
             f"linear_path: a linear map of the pixels of modality {modality!r} says "
-            "nothing; allowed: trajectories"
+            "nothing; allowed: trajectories, video"
         )
-    args.batch_observations = min(args.batch_observations, args.observations)
-    args.table_observations = min(args.table_observations, args.observations)
+    for name in ("batch_observations", "table_observations"):  # of few, a recipe takes all
+        if name not in given:
+            setattr(args, name, min(getattr(args, name), args.observations))
+    if args.batch_observations > args.observations:
+        raise ValueError(
+            f"batch_observations {args.batch_observations} is more than the "
+            f"{args.observations} observations of each action"
+        )
     return args
 
 
@@ -506,8 +528,11 @@ class ObservationEncoder(nn.Module):
             last = nn.Linear(2 * hidden, hidden)
             middle = nn.Sequential(nn.ReLU(), Residual(2 * hidden, 2))
             self.sequence = nn.Sequential(nn.Flatten(), first, middle, last, nn.ReLU())
-        # For the linear path of ActionInference, the numbers themselves ride along at the end.
-        self.numbers = fmt.length * features if args.linear_path else 0
+        # For the linear path of ActionInference, the numbers themselves ride along at the end; of a
+        # video its frames in pieces of 4 x 4 pixels: 12 x 12 numbers each.
+        self.is_video = fmt.kind == "video"
+        each = (fmt.features // COARSE) ** 2 if self.is_video else features
+        self.numbers = fmt.length * each if args.linear_path else 0
         self.size = hidden + self.numbers  # H
 
     def frames(self, x: torch.Tensor) -> torch.Tensor:
@@ -515,11 +540,15 @@ class ObservationEncoder(nn.Module):
         return x if self.conv is None else self.conv(x.flatten(0, 1)).unflatten(0, x.shape[:2])
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.summary(self.frames(x))
+        return self.summary(x, self.frames(x))
 
-    def summary(self, x: torch.Tensor) -> torch.Tensor:
-        h = self.sequence(x)
-        return torch.cat([h, x.flatten(1)], 1) if self.numbers else h  # (B, H)
+    def summary(self, x: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
+        h = self.sequence(frames)
+        if not self.numbers:
+            return h  # (B, H)
+        if self.is_video:  # (B, L, 1, S, S) -> (B * L, 1, S, S) -> (B, L, 1, S / 4, S / 4)
+            x = F.avg_pool2d(x.flatten(0, 1), COARSE).unflatten(0, x.shape[:2])
+        return torch.cat([h, x.flatten(1)], 1)  # (B, H)
 
 
 # ---- D.3.1 Action Inference Network ----
@@ -531,7 +560,8 @@ class ActionInference(nn.Module):
     With a linear path (ours), the mean of c is a linear map of the averaged observations plus 0.1
     of what the networks say. Networks are free to give every training skill a place of its own, and
     what they do between those places is anyone's guess; a linear map that tells the training
-    skills' moves apart has no choice but to do the same with skills it has not seen.
+    skills' moves apart has no choice but to do the same with skills it has not seen. The 0.1 also
+    is the networks' share in the log-variance, which stays close to one value for all of it.
     """
 
     def __init__(self, hidden: int, width: int, size: int, numbers: int = 0):
@@ -639,6 +669,9 @@ class ConvDecoder(nn.Module):
             layers += [nn.BatchNorm2d(after), nn.ReLU()]
             width = after
         layers += [nn.Conv2d(width, 1 + mask, 1), nn.Sigmoid()]
+        if mask:  # ours: a picture starts white, as most of a video is. If it starts grey, opening
+            # the mask makes everything worse, so it shuts before anything is learned behind it.
+            nn.init.constant_(layers[-2].bias[:1], 3.0)
         self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -704,7 +737,7 @@ class ObservationModel(nn.Module):
         "error"}; error is the squared error, or the share of wrong classes."""
         inputs, start, target = prepare(raw.flatten(0, 1), self.format)  # (B, ...)
         frames = self.encoder.frames(inputs)
-        latents, kl_z, kl_c = self.infer(self.encoder.summary(frames), raw.shape[1], sample)
+        latents, kl_z, kl_c = self.infer(self.encoder.summary(inputs, frames), raw.shape[1], sample)
         output = self.decode(start, *latents, first=frames[:, 0])
         rec = self.log_likelihood(target, output).mean()
         # One c serves the whole set, so each of its observations bears a part of the price of c.
@@ -817,7 +850,8 @@ def keep_memory() -> None:
     with suppress(AttributeError, OSError, TypeError):  # another system's library has no mallopt
         libc = ctypes.CDLL(None)
         libc.mallopt(M_TRIM_THRESHOLD, most)
-        libc.mallopt(M_MMAP_THRESHOLD, most)
+        # Older versions take no more than 32 MB.
+        libc.mallopt(M_MMAP_THRESHOLD, most) or libc.mallopt(M_MMAP_THRESHOLD, 2**25)
 
 
 def observe(module: ModuleType, ids: np.ndarray, n: int, args: Args) -> np.ndarray:
@@ -838,7 +872,7 @@ def pick(rng: np.random.Generator, stored: int, actions: int, n: int) -> np.ndar
 
 
 def fit(model: ObservationModel, data: np.ndarray, args: Args) -> list[dict]:
-    """Maximise the ELBO on data (actions, stored, ...), raw observations of the training actions.
+    """Maximise the objective on raw observations of the training actions: (actions, stored, ...).
 
     Returns one row of mean losses per 100 updates. Raises ValueError if the loss becomes infinite.
     """
@@ -859,7 +893,7 @@ def fit(model: ObservationModel, data: np.ndarray, args: Args) -> list[dict]:
         ids = order[update % per_epoch * batch :][:batch, None]  # (A, 1)
         raw = data[ids, pick(rng, data.shape[1], batch, args.batch_observations)]  # (A, n, ...)
         parts = model(raw.to(device))
-        # All of the loss is the ELBO once the warm-up is over; the log always shows the ELBO.
+        # All of the objective counts once the warm-up is over; the log always shows all of it.
         waived = max(0.0, 1 - (update + 1) / (args.kl_warmup * updates + 1))
         loss = parts["loss"] - waived * (parts["kl_z"] + parts["kl_c"])
         optimiser.zero_grad()
@@ -1365,6 +1399,10 @@ def main() -> None:
         print(f"representations: {train(args)}")
     except (ValueError, OSError, MemoryError) as e:
         raise SystemExit(f"error: {e}") from None
+    except RuntimeError as e:  # torch has no error of its own for too little memory
+        if "memory" not in str(e):
+            raise
+        raise SystemExit(f"error: {str(e).splitlines()[0]}") from None
 
 
 if __name__ == "__main__":

@@ -938,7 +938,17 @@ def load_table(args: Args, train_ids: np.ndarray) -> np.ndarray:
                 f"representation {kind!r} is not one of hvae, hvae-all, vae, engineered, "
                 "engineered-5d, engineered-path, or the path of an .npz file"
             )
-        table = hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
+        loaded = hvae.load_representation(path, args.env, args.split, args.split_seed)
+        if kind in ("hvae", "hvae-all", "vae"):
+            # A recipe may have changed since its table was made.
+            wanted = hvae.settings(hvae.resolve(hvae_args))
+            for name in hvae.OVERRIDES:
+                if (there := loaded["config"].get(name, wanted[name])) != wanted[name]:
+                    raise ValueError(
+                        f"{path} was made with {name} {there}, the recipe now has {wanted[name]}: "
+                        "delete it, and it is made again"
+                    )
+        table = loaded["mean"]
     if args.standardize:
         std = table[train_ids].std(0)
         std[std < 1e-6] = 1.0  # constant in training: no scale to learn, whatever others have

@@ -843,8 +843,9 @@ def play_episode(env: RecSysEnv, policy: str, seed: int, every: int = 0) -> tupl
 
 def main(args: Args) -> None:
     """What `python recsys.py` does."""
-    if args.episodes < 1:
-        raise ValueError(f"episodes is {args.episodes}; allowed: 1 or more")
+    for name, value, least in (("episodes", args.episodes, 1), ("seed", args.seed, 0)):
+        if value < least:
+            raise ValueError(f"{name} is {value}; allowed: {least} or more")
     pool = split_actions(seed=args.seed)[args.pool]
     env = RecSysEnv(pool, args.num_available, "rgb_array")
     _print_summary(args, pool)

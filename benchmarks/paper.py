@@ -388,7 +388,7 @@ class Args:
     recipe: str = "fast"
     """fast or paper, see ppo_actiongen.py."""
     hvae_recipe: str = "laptop"
-    """laptop, quick, lstm or paper, see hvae.py."""
+    """laptop, quick, lstm, mlp or paper, see hvae.py."""
     extra: str = ""
     """Further flags for every training command, as in --extra="--eval-episodes 100"."""
     extra_encoder: str = ""
@@ -902,8 +902,9 @@ def run_all(plans: list[Plan], args: Args) -> list[bool]:
     return done
 
 
-def show(plans: list[Plan]) -> None:
-    """--dry-run: every command with its hours on one core; shared ones under the first figure."""
+def show(plans: list[Plan], args: Args) -> None:
+    """--dry-run: every command, to be run as it is, with its hours on one core; shared ones under
+    the first figure."""
     listed, left, count = set(), 0.0, 0
     for p in plans:
         new = [job for job in p.everything if job.key not in listed]
@@ -912,7 +913,10 @@ def show(plans: list[Plan]) -> None:
         print(f"\n{p.name}: {EXPERIMENTS[p.name].shows}")
         print(f"    {len(new)} commands" + (f", {shared} more are listed above" * bool(shared)))
         for job in new:
-            print(f"{'done' if job.finished else f'{job.hours:.2f} h':>8}  {job.command}")
+            command = job.command
+            if isinstance(job, Run):
+                command += f" --runs-dir {args.runs_dir} --run-name {job.folder.name}"
+            print(f"{'done' if job.finished else f'{job.hours:.2f} h':>8}  {command}")
             left, count = left + (0 if job.finished else job.hours), count + (not job.finished)
     print(
         f"\n{count} of {len(listed)} to run, about {left:.1f} hours on one core, "
@@ -926,7 +930,7 @@ def main() -> None:
     try:
         plans = plan(args)
         if args.dry_run:
-            return show(plans)
+            return show(plans, args)
         done = run_all(plans, args)
     except ValueError as e:
         raise SystemExit(f"error: {e}") from None

@@ -66,6 +66,7 @@ METHODS = {
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {
+    "fig8": "Ours, in a hurry",
     "fig10": "Main",
     "fig11": "Main",
     "fig13": "1D Place",
@@ -78,7 +79,8 @@ TITLES = {
     "stacking": "Shape Stacking, height",
 }
 QUANTITIES = {"recsys": "click-through rate", "stacking": "height"}  # others: success rate
-BAR_KEY = "filled: this repository (dots: seeds)   outlined: published   line: ceiling"
+BAR_KEY = "filled: this repository (dots: seeds)   outlined: published"
+CEILING_KEY = "   line: ceiling with unseen actions"
 
 # The differences of the fast recipe: what is undone in each row of "<environment>-recipe", and what
 # the recipe does instead.
@@ -97,7 +99,7 @@ RECIPE = {
             "and networks half as wide: 64, utility 128",
             '128, utility 256: "left of the river after three moves" takes many ReLUs',
         ),
-        "utility_width_64": ("the same, utility 64", ""),
+        "utility_width_64": ("utility 64 instead of 128", ""),
         "gains_0.01": (
             "gains 0.01 in all three utility layers",
             "1, sqrt 2, 0.01: a product of three small layers starves its own gradient",
@@ -141,8 +143,9 @@ RECIPE = {
     },
 }
 RECIPE_NOTE = {
-    "gridworld-recipe": "Engineered representation; each row down to the narrow networks keeps "
-    "what those above it have undone, and each one below them keeps all of that",
+    "gridworld-recipe": "Engineered representation. Rows 2 to 4 add up: each keeps what those "
+    "above it have undone. Every later row undoes one thing more, starting from row 4 (networks "
+    "half as wide): compare it with that one",
     "create-recipe": "Learned representation; the second row pays later (2M steps above), and each "
     "one below it keeps what it has undone",
 }
@@ -183,6 +186,11 @@ def shown(experiment: str) -> dict[str, list[str]]:
             env: sorted(methods, key=lambda m: order.get(m, 0)) for env, methods in found.items()
         }
     return {env: methods for env, methods in found.items() if methods}
+
+
+def color_of(method: str):
+    """One colour per method, the same in every picture of bars."""
+    return plt.get_cmap("tab20")(list(METHODS).index(method) % 20)
 
 
 def spread(values: list[float], digits: int = 3) -> str:
@@ -277,8 +285,9 @@ def table(env: str) -> str:
     note = f"Ceiling: {ceiling[1]}{phases.format(*ceiling)}. " if ceiling else ""
     lines.append(
         f"\n{note}± is the standard deviation over seeds; hours are per seed on {cores}. "
-        f"Command: `python benchmarks/paper.py {env}`; every row's own command is in "
-        f"`results/{paper.file_of(env)}.csv`."
+        f"Command: `python benchmarks/paper.py {env}`, which makes all of it with three seeds and "
+        "the full budgets; these rows were made with the `--seeds`, `--budget` and `--extra` that "
+        f"their commands in `results/{paper.file_of(env)}.csv` show."
     )
     return "\n".join(lines)
 
@@ -306,20 +315,24 @@ def recipe_table(env: str) -> str:
 
 def bar_figure(env: str, path: Path) -> None:
     """Train and test bars per method, ours filled and published outlined."""
-    ours, theirs = scores(env), published(env)
+    ours, long, theirs = scores(env), longest(env), published(env)
     methods = shown(env)[env]
     usual = usual_budget(ours, methods)
+    # What has no published bar to stand beside is shown at its best: its longest runs.
+    for key in [(m, p) for m in methods for p in ("train", "test") if (m, p) not in theirs]:
+        ours[key] = long[key]
     figure, axes = plt.subplots(1, 2, figsize=(11, 3.8), sharey=True)
     for axis, phase, title in zip(
         axes, ("train", "test"), ("training actions", "unseen actions"), strict=True
     ):
         for x, method in enumerate(methods):
             values = [float(r["score"]) for r in ours[method, phase]]
-            axis.bar(x - 0.2, mean(values), 0.38, color=f"C{x}", alpha=0.85)
+            axis.bar(x - 0.2, mean(values), 0.38, color=color_of(method), alpha=0.85)
             axis.plot([x - 0.2] * len(values), values, "k.", ms=4)
             if (method, phase) in theirs:
                 m, s, _ = theirs[method, phase]
-                axis.bar(x + 0.2, m, 0.38, yerr=s, fill=False, edgecolor=f"C{x}", capsize=2)
+                look = dict(fill=False, edgecolor=color_of(method), capsize=2)
+                axis.bar(x + 0.2, m, 0.38, yerr=s, **look)
         if env in ppo_actiongen.CEILINGS:
             ceiling = ppo_actiongen.CEILINGS[env][phase == "test"]
             axis.axhline(ceiling, color="grey", lw=1)
@@ -328,7 +341,8 @@ def bar_figure(env: str, path: Path) -> None:
         axis.set_title(title)
         axis.spines[["top", "right"]].set_visible(False)
     name = TITLES.get(env, paper.TITLES.get(env, env))
-    figure.suptitle(f"{name}, {usual} steps where no others are named\n{BAR_KEY}", fontsize=9)
+    key = BAR_KEY + "   line: ceiling" * (env in ppo_actiongen.CEILINGS)
+    figure.suptitle(f"{name}, {usual} steps where no others are named\n{key}", fontsize=9)
     save(figure, path)
 
 
@@ -342,9 +356,11 @@ def curve_figure(env: str, path: Path) -> None:
         lines,
         columns,
         figsize=(max(5, 2.6 * columns), 2.6 if lines == 1 else 2.3 * lines),
+        sharex=True,
         sharey=True,
         squeeze=False,
     )
+    axes[0, 0].set_xlim(0, 1.02 * max(int(r["step"]) for r in rows) / 1e6)
     for axis, method in zip(axes.flat, methods, strict=False):
         mine = [r for r in rows if r["method"] == method]
         for seed in sorted({r["seed"] for r in mine}):
@@ -356,8 +372,10 @@ def curve_figure(env: str, path: Path) -> None:
         axis.set_title(METHODS[method], fontsize=9)
     for axis in axes.flat[len(methods) :]:
         axis.axis("off")
-    for axis in axes[-1]:
-        axis.set_xlabel("million steps", fontsize=8)
+    for i, axis in enumerate(axes.flat[: len(methods)]):
+        if i + columns >= len(methods):  # the last one of its column
+            axis.set_xlabel("million steps", fontsize=8)
+            axis.tick_params(labelbottom=True)
     for axis in axes[:, 0]:
         axis.set_ylabel(quantity(env), fontsize=8)
     name = TITLES.get(env, paper.TITLES.get(env, env))
@@ -433,7 +451,7 @@ def panel_figure(experiment: str, path: Path) -> None:
         for x, method in enumerate(methods):
             for at, phase, alpha in ((x - 0.2, "train", 0.35), (x + 0.2, "test", 0.9)):
                 values = [float(r["score"]) for r in ours[method, phase]]
-                axis.bar(at, mean(values), 0.32, color=f"C{x}", alpha=alpha)
+                axis.bar(at, mean(values), 0.32, color=color_of(method), alpha=alpha)
                 axis.plot([at] * len(values), values, "k.", ms=3)
                 if (method, phase) in theirs:
                     m, s, _ = theirs[method, phase]
@@ -448,7 +466,8 @@ def panel_figure(experiment: str, path: Path) -> None:
         axis.spines[["top", "right"]].set_visible(False)
     for axis in axes.flat[len(found) :]:
         axis.axis("off")
-    figure.suptitle(f"pale: seen, full: unseen actions\n{BAR_KEY}", fontsize=7)
+    key = BAR_KEY + CEILING_KEY * any(env in ppo_actiongen.CEILINGS for env in found)
+    figure.suptitle(f"pale: seen, full: unseen actions\n{key}", fontsize=7)
     save(figure, path)
 
 
@@ -460,30 +479,39 @@ def save(figure, path: Path) -> None:
 
 
 def all_curves(experiment: str, path: Path) -> None:
-    """Figure 14: one row of panels per environment, one column per method."""
+    """Figure 14: one column of panels per environment, one line of them per method."""
     curves = {env: runs_of(env, "_curves") for env in shown(experiment)}
+    known = {method for methods in shown(experiment).values() for method in methods}
     methods = [
-        m for m in METHODS if any(r["method"] == m for rows in curves.values() for r in rows)
+        m
+        for m in METHODS
+        if m in known and any(r["method"] == m for c in curves.values() for r in c)
     ]
-    methods = [m for m in methods if any(m in found for found in shown(experiment).values())]
-    size = (2.1 * len(methods), 1.9 * len(curves) + 0.4)
-    figure, axes = plt.subplots(len(curves), len(methods), figsize=size, squeeze=False)
-    for line, (env, rows) in zip(axes, curves.items(), strict=True):
-        top = max(float(r[k]) for r in rows for k in ("train_score", "valid_score"))
-        for axis, method in zip(line, methods, strict=True):
-            mine = [r for r in rows if r["method"] == method]
-            axis.set_visible(bool(mine))
-            for seed in sorted({r["seed"] for r in mine}):
-                one = [r for r in mine if r["seed"] == seed]
-                steps = [int(r["step"]) / 1e6 for r in one]
+    size = (1.75 * len(curves) + 0.3, 1.25 * len(methods) + 0.7)
+    figure, axes = plt.subplots(
+        len(methods), len(curves), figsize=size, squeeze=False, sharex="col", sharey="col"
+    )
+    for column, (env, rows) in zip(axes.T, curves.items(), strict=True):
+        mine = [r for r in rows if r["method"] in methods]
+        top = max(float(r[k]) for r in mine for k in ("train_score", "valid_score"))
+        column[0].set_ylim(0, max(1.05 * top, 0.05))
+        column[0].set_xlim(0, 1.03 * max(int(r["step"]) for r in mine) / 1e6)
+        for axis, method in zip(column, methods, strict=True):
+            of = [r for r in mine if r["method"] == method]
+            for seed in sorted({r["seed"] for r in of}):
+                one = [r for r in of if r["seed"] == seed]
+                steps, few = [int(r["step"]) / 1e6 for r in one], len(one) < 3
                 for color, key in (("C0", "train_score"), ("C1", "valid_score")):
-                    axis.plot(steps, [float(r[key]) for r in one], color, lw=1, marker=".", ms=2)
-            axis.set_ylim(0, 1.05 * top + 1e-6)
-            title = paper.TITLES[env].removesuffix(", partially observable")
-            axis.set_title(f"{title}\n{METHODS[method]}", fontsize=7)
-            axis.tick_params(labelsize=6)
-        line[0].set_ylabel(quantity(env), fontsize=7)
-    figure.suptitle("seen (blue) and validation actions (orange) over million steps", fontsize=9)
+                    look = dict(lw=1, marker=".", ms=5 if few else 2)
+                    axis.plot(steps, [float(r[key]) for r in one], color, **look)
+            axis.tick_params(labelsize=8)
+            if not of:
+                axis.text(0.5, 0.5, "-", transform=axis.transAxes, ha="center", color="0.6")
+        column[0].set_title(paper.TITLES[env].replace(", partially", "\npartially"), fontsize=8)
+        column[-1].set_xlabel("million steps", fontsize=8)
+    for line, method in zip(axes, methods, strict=True):
+        line[0].set_ylabel(METHODS[method].replace(" ", "\n", 1), fontsize=8)
+    figure.suptitle("scores with seen (blue) and validation actions (orange)", fontsize=9)
     save(figure, path)
 
 
@@ -658,7 +686,10 @@ def analysis_figure(experiment: str, path: Path) -> None:
         for i, method in enumerate(m for e, m in found if e == env):
             points = found[env, method]
             means = [mean(float(r["score"]) for r in rows) for rows in points.values()]
-            axis.plot(list(points), means, f"C{i}o-", ms=3, label=METHODS[method])
+            # Standard error over the episodes of a test, and seeds as dots.
+            errors = [mean(float(r["stderr"]) for r in rows) for rows in points.values()]
+            look = dict(fmt=f"C{i}o-", ms=3, capsize=2, elinewidth=0.8)
+            axis.errorbar(list(points), means, errors, label=METHODS[method], **look)
             for x, rows in points.items():
                 axis.plot([x] * len(rows), [float(r["score"]) for r in rows], f"C{i}.", ms=2)
             known = published_analysis(experiment, env, method)
@@ -703,7 +734,11 @@ def encoder_table(experiment: str) -> str:
         of = {r["panel"]: r for r in rows if r["score"] == name}
         cells = [
             f"{float(of[p]['value']):.3f}"
-            + (f" ({float(of[p]['published']):.3f})" if of[p]["published"] else "")
+            + (
+                f" ({float(of[p]['published']):.3f})"
+                if of[p]["published"] and p not in OUR_ENCODERS
+                else ""
+            )
             if p in of and of[p]["value"] != "nan"  # where all of them have the same value
             else "-"
             for p in panels
@@ -721,6 +756,9 @@ def encoder_table(experiment: str) -> str:
         "\n\nHeld-out actions; `probe` in `hvae.py` says what the scores mean."
         f"{same * apart}{note} Minutes on one busy core."
     )
+
+
+OUR_ENCODERS = ("MLP encoder", "linear path")  # panels of encoders that the paper does not have
 
 
 def tsne_figure(experiment: str, path: Path) -> None:
@@ -745,7 +783,7 @@ def tsne_figure(experiment: str, path: Path) -> None:
             axis.scatter(*(zip(*xy, strict=True) if xy else ((), ())), label=name, **look)
         axis.set(xticks=[], yticks=[])
         axis.set_title(panel, fontsize=10)
-        axis.spines[:].set_visible(False)
+        axis.spines[:].set(linewidth=0.4, color="0.7")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     columns = min(8, len(names))
     figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False, fontsize=7)
@@ -838,6 +876,8 @@ def fill(text: str, experiment: str) -> str:
 def main() -> None:
     """Draw everything there are results for, and write (or check) the README's tables."""
     global RESULTS
+    for flag in (a for a in sys.argv[1:] if a.startswith("-") and a != "--check"):
+        raise SystemExit(__doc__ if flag in ("-h", "--help") else f"error: unknown option {flag}")
     for folder in (a for a in sys.argv[1:] if not a.startswith("-")):
         RESULTS = Path(folder)
         if not RESULTS.is_dir():

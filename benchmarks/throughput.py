@@ -592,6 +592,8 @@ def hvae_pictures() -> Iterator[Row]:
 def main() -> None:
     """Run the groups named on the command line (default: all) and print one table."""
     names = sys.argv[1:] or list(GROUPS)
+    if {"-h", "--help"} & set(names):
+        raise SystemExit(f"{__doc__}\ngroups: {', '.join(GROUPS)}")
     unknown = [name for name in names if name not in GROUPS]
     if unknown:
         raise SystemExit(f"error: unknown group {unknown[0]!r}; allowed: {', '.join(GROUPS)}")

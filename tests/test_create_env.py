@@ -995,7 +995,7 @@ def test_probe_video():
     video = c.action_observations(ids, 3, "video", workers=2, cache=None)
     assert video.shape == (3, 3, 7, 48, 48) and video.dtype == np.uint8
     for frame, state in zip(video[0].reshape(-1, 48, 48), states[0].reshape(-1, 6), strict=True):
-        x, y = state[2:4] * 24 + 24
+        x, y = (state[2:4] - state[:2]) * 24 + 24  # the camera stands over the tool
         if 1 < x < 47 and 1 < y < 47:
             assert frame[int(48 - y), int(x)] == 163  # the ball
     assert (video[2].reshape(21, -1).min(axis=1) >= 163).all()  # the no-op has no picture

@@ -1,6 +1,7 @@
 """The HVAE against torch's distributions, the published layer sizes, and damaged files."""
 
 import ctypes
+import dataclasses
 import json
 import subprocess
 import sys
@@ -180,6 +181,22 @@ def test_shut_mask_shows_the_first_frame_and_open_mask_the_picture():
     assert shut.shape == target.shape
     torch.testing.assert_close(shut, start[:, None].expand_as(shut))
     torch.testing.assert_close(opened, torch.full_like(opened, 0.5))
+
+
+def test_new_decoder_of_videos_paints_white_behind_a_half_open_mask():
+    """Grey paper would shut the mask before anything is learned behind it."""
+    features = torch.randn(8, hvae.CONV_FEATURES)
+    picture, mask = hvae.ConvDecoder(48, mask=True)(features)
+    assert picture.mean() > 0.4 and 0.3 < mask.mean() < 0.7
+    assert abs(hvae.ConvDecoder(84, mask=False)(features)[0].mean()) < 0.2
+
+
+def test_linear_path_of_a_video_sees_its_frames_in_coarse_pixels():
+    model, raw = small("video", linear_path=True)
+    x = hvae.prepare(raw.flatten(0, 1), model.format)[0]  # (6, 3, 1, 48, 48)
+    numbers = model.encoder(x)[:, -3 * 12 * 12 :]
+    expected = x[:, 1, 0, 4:8, 40:44].mean((1, 2))  # second frame, second row, column 11
+    torch.testing.assert_close(numbers[:, 144 + 12 + 10], expected)
 
 
 def test_video_looks_at_every_frame_once():
@@ -400,6 +417,10 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
     (dict(learning_rate=np.nan), "learning_rate must be a positive number, got nan"),
     (dict(seed=-1), "seed must be 0 or more, got -1"),
     (dict(epochs=2, updates=3), "epochs and updates: give one"),
+    (dict(epochs=10_000, updates=3), "epochs and updates: give one"),
+    (dict(decoder_log_var=9.0), "decoder_log_var must be between -4 and 3, got 9.0"),
+    (dict(decoder_log_var=float("nan")), "decoder_log_var must be between"),
+    (dict(observations=8, batch_observations=9), "batch_observations 9 is more than the 8"),
     (dict(hierarchical=False, q_hidden=7), "q_hidden has no effect here: .* plain VAE"),
     (dict(modality="onehot", decoder_log_var=-1.0), "decoder_log_var has no effect here"),
     (dict(env="stacking", encoder="mlp"), "encoder has no effect here: modality image"),
@@ -462,7 +483,8 @@ def test_tables_3_and_4():
 def test_every_modality_trains_and_is_drawn(tmp_path, env, modality, size, hierarchical):
     """Real observations of four actions: one update, reconstructions in raw units, a picture."""
     module = hvae.load_environment(env)
-    args = hvae.resolve(Args(env=env, modality=modality, updates=1, batch_observations=2))
+    args = Args(env=env, modality=modality, hierarchical=hierarchical)
+    args = hvae.resolve(dataclasses.replace(args, updates=1, batch_observations=2))
     raw = module.action_observations(np.arange(4), 2, modality, seed=0, workers=1)
     fmt = Format.of(env, modality, raw.shape, args.relative)
     model = (HVAE if hierarchical else VAE)(fmt, args)

@@ -941,6 +941,25 @@ def test_published_numbers_stand_only_beside_what_was_published():
     assert not ppo.published_scores(replace(usual, modality="onehot"))
 
 
+def test_a_table_of_another_recipe_is_refused(tmp_path, monkeypatch):
+    """A recipe that changed would else go on with the table it had before."""
+    args = ppo.default_args("gridworld", "fast", False)
+    args.runs_dir, args.standardize = str(tmp_path), False
+    wanted = ppo.hvae.Args(env="gridworld", runs_dir=str(tmp_path))
+    path, train_ids = ppo.hvae.representation_path(wanted), np.arange(512)
+    table = np.random.default_rng(0).normal(size=(1024, 16)).astype(np.float32)
+    config = ppo.hvae.settings(ppo.hvae.resolve(wanted))
+    for updates, there in ((config["updates"], True), (9, False)):
+        config["updates"] = updates
+        ids = ppo.importlib.import_module("gridworld").split_actions()["train"]
+        ppo.hvae.save_representation(path, "gridworld", table, table, ids, config)
+        if there:
+            np.testing.assert_array_equal(ppo.load_table(args, train_ids), table)
+        else:
+            with pytest.raises(ValueError, match="updates 9, the recipe now has 1000: delete it"):
+                ppo.load_table(args, train_ids)
+
+
 def test_names_tell_runs_apart():
     """Two runs that differ in what they are do not share a name, and so a folder."""
 

@@ -85,5 +85,5 @@ def test_example_of_an_own_action_encoder_is_accepted_by_the_policy(tmp_path):
     words += " --total-timesteps 512 --eval-episodes 8 --valid-episodes 8 --no-tensorboard"
     command = [sys.executable, str(ROOT / "ppo_actiongen.py"), *words.split()]
     subprocess.run(command, cwd=tmp_path, check=True, timeout=300)
-    results = json.loads((tmp_path / "runs/gridworld-ours-s0/results.json").read_text())
+    results = json.loads((tmp_path / "runs/gridworld-ours_endpoints-s0/results.json").read_text())
     assert results["test"]["episodes"] == 8
