@@ -575,7 +575,7 @@ class ActionInference(nn.Module):
         )
         # appendix: 3 layers; published code: 4 (a block of 3 and the output); we do as the code.
         self.after = nn.Sequential(Residual(width, 3), nn.Linear(width, 2 * size))
-        self.norm = GlobalBatchNorm()
+        self.norm = GlobalBatchNorm()  # published code: over mean and log-variance together
 
     def forward(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         pooled = self.before(h).mean(1)  # (A, n, width) -> (A, width), whatever the order and n
