@@ -549,7 +549,8 @@ class ObservationEncoder(nn.Module):
         if not self.numbers:
             return h  # (B, H)
         if self.is_video:  # (B, L, 1, S, S) -> (B * L, 1, S, S) -> (B, L, 1, S / 4, S / 4)
-            x = F.avg_pool2d(x.flatten(0, 1), COARSE).unflatten(0, x.shape[:2])
+            dark = 0.5 - x.flatten(0, 1)  # white paper is 0, or it would drown what is drawn on it
+            x = F.avg_pool2d(dark, COARSE).unflatten(0, x.shape[:2])
         return torch.cat([h, x.flatten(1)], 1)  # (B, H)
 
 

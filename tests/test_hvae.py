@@ -195,7 +195,7 @@ def test_linear_path_of_a_video_sees_its_frames_in_coarse_pixels():
     model, raw = small("video", linear_path=True)
     x = hvae.prepare(raw.flatten(0, 1), model.format)[0]  # (6, 3, 1, 48, 48)
     numbers = model.encoder(x)[:, -3 * 12 * 12 :]
-    expected = x[:, 1, 0, 4:8, 40:44].mean((1, 2))  # second frame, second row, column 11
+    expected = 0.5 - x[:, 1, 0, 4:8, 40:44].mean((1, 2))  # second frame, second row, column 11
     torch.testing.assert_close(numbers[:, 144 + 12 + 10], expected)
 
 
