@@ -1724,7 +1724,7 @@ class Run:
 
         The discrete policy's outputs are training actions, so that head starts anew, and with it
         the stop head (published code). The statistics of the states stand still from here on.
-        The running scale of the rewards starts anew too (silent in paper and code).
+        The running scale of the rewards starts anew too (appendix: silent).
         Raises ValueError when the run was trained with other networks, another table, another split
         (what is new here may not have been new there) or states that enter the networks otherwise.
         """
