@@ -166,9 +166,12 @@ def published(env: str) -> dict[tuple[str, str], tuple[float, float, int]]:
         for r in read(PUBLISHED / "published_results.csv")
         if (r["env"], r["task"]) == (name.replace("-", "_"), task)
     ]
-    return {
+    found = {
         (r["method"], r["phase"]): (float(r["mean"]), float(r["std"]), int(r["n"])) for r in rows
     }
+    if "ours_paper_recipe" in paper.RUNS.get(env, {}):  # what the paper's "ours" was made with
+        found |= {("ours_paper_recipe", p): v for (m, p), v in found.items() if m == "ours"}
+    return found
 
 
 def label(method: str, experiment: str = "") -> str:
@@ -203,7 +206,8 @@ def spread(values: list[float], digits: int = 3) -> str:
 
 def millions(rows: list[dict]) -> str:
     """The number of steps of these rows, as the tables write it: 10M, 0.04M."""
-    return f"{round(int(rows[0]['steps']) / 1e6, 2):g}M"
+    steps = int(rows[0]["steps"]) / 1e6
+    return f"{round(steps, 2 if steps < 10 else 1):g}M"
 
 
 def usual_budget(ours: dict, methods: Sequence[str]) -> str:
