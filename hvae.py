@@ -37,7 +37,7 @@ import importlib
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -268,10 +268,24 @@ def resolve(args: Args) -> Args:
             preset |= dict(updates=RECIPES["mlp"]["updates"])
     if args.epochs and args.updates:
         raise ValueError("epochs and updates: give one of them")
-    if args.epochs and not args.updates:
+    if args.epochs:
         preset.pop("updates", None)  # asked for in epochs: the recipe's number steps back
     given = {key: value for key, value in asdict(args).items() if value is not None}
     args = replace(args, **(preset | given | dict(modality=modality)))
+    for name in ("batch_observations", "table_observations"):  # of few, a recipe takes all
+        if name not in given:
+            setattr(args, name, min(getattr(args, name), args.observations))
+    check(args, given)
+    return args
+
+
+COUNTS = ("representation_size", "batch_size", "epochs", "updates", "observations", "threads")
+COUNTS += ("batch_observations", "table_observations", "set_size", "q_hidden", "hidden")
+
+
+def check(args: Args, given: Container[str]) -> None:
+    """Refuse resolved settings that are out of range or, if the user gave them, without effect."""
+    modality = args.modality
     for name in COUNTS:
         if (value := getattr(args, name)) is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
@@ -310,19 +324,11 @@ def resolve(args: Args) -> Args:
             f"linear_path: a linear map of the pixels of modality {modality!r} says "
             "nothing; allowed: trajectories, video"
         )
-    for name in ("batch_observations", "table_observations"):  # of few, a recipe takes all
-        if name not in given:
-            setattr(args, name, min(getattr(args, name), args.observations))
     if args.batch_observations > args.observations:
         raise ValueError(
             f"batch_observations {args.batch_observations} is more than the "
             f"{args.observations} observations of each action"
         )
-    return args
-
-
-COUNTS = ("representation_size", "batch_size", "epochs", "updates", "observations", "threads")
-COUNTS += ("batch_observations", "table_observations", "set_size", "q_hidden", "hidden")
 
 
 # ---- observations as the networks see them (appendix B) ----
