@@ -844,8 +844,8 @@ def advance(space: pymunk.Space, steps: int) -> None:
     """So many physics steps of DT, the same as calling space.step(DT) so many times.
 
     `Space.step` checks new bodies and looks for what a rule has put off until the step is over;
-    then it calls the C library, a third of its time. Our rules put nothing off, so after the
-    first step the rest can go there directly.
+    then it calls the C library, the smaller part of its time. Our rules put nothing off, so after
+    the first step the rest can go there directly.
     """
     space.step(DT)
     for _ in range(steps - 1):

@@ -196,8 +196,8 @@ PICTURES = dict(  # what holds for CREATE's trajectories holds for them
 
 # Ours. In the time there is, networks learn where the ball no longer is, not where it goes, and
 # need no c for that: a linear map of the averaged frames says more about a tool they have not seen.
-# At the rate of the trajectories, 0.003, that map drifts (`nn_class` falls), since nothing needs it
-# to stay what it was.
+# Table 4's rate: at that of the trajectories, 0.003, an earlier form of the map lost half of the
+# classes while training (`nn_class`), since nothing needs it to stay what it was.
 VIDEO = dict(batch_size=16, batch_observations=4, linear_path=True, learning_rate=1e-3)
 
 # Ours. Where a skill ends is learned early; in which order it moves takes thousands of updates

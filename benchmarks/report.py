@@ -479,7 +479,7 @@ def panel_figure(experiment: str, path: Path) -> None:
 
 
 def save(figure, path: Path) -> None:
-    """Write a picture in at most 256 colours, a third of the bytes, and forget the figure."""
+    """Write a picture in at most 256 colours, less than half the bytes, and forget the figure."""
     with BytesIO() as file:
         figure.savefig(file, dpi=110)
         Image.open(file).convert("RGB").quantize(256).save(path, optimize=True)
