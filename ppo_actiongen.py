@@ -1208,12 +1208,15 @@ def update(agent, optimizer, batch, ent_coef, args: Args, generator, device):
 
 
 @torch.no_grad()
-def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=None, greedy=False):
+def evaluate(
+    agent, preprocess, args, pool, episodes, seed, num_available=None, greedy=False, tally=None
+):
     """Score of the frozen policy on `episodes` episodes with actions of `pool`.
 
     Actions are sampled, as published (greedy is an extra). Every environment plays the same number
     of episodes: stopping at "the first so many to finish" would favour short ones.
-    Returns dict(score, stderr, episodes, return, length).
+    Returns dict(score, stderr, episodes, return, length). `tally` (2, A), if given, counts how
+    often each action was chosen and how often it was on offer.
     """
     module = importlib.import_module(MODULES[args.env])
     num_available = num_available or args.eval_available or args.num_available
@@ -1232,6 +1235,11 @@ def evaluate(agent, preprocess, args: Args, pool, episodes, seed, num_available=
     while (played < quota).any():
         state, available = preprocess(obs["state"]), torch.as_tensor(obs["available"])
         action, *_ = agent.act(state.to(device), available.to(device), P, generator, greedy)
+        if tally is not None:
+            counted = torch.as_tensor(played < quota)
+            taken = available.gather(1, action["choice"][:, None].cpu())  # (N, K), (N, 1) -> (N, 1)
+            for row, ids in enumerate((taken, available)):
+                tally[row] += np.bincount(ids[counted].flatten(), minlength=tally.shape[1])
         obs, _, terminated, truncated, infos = envs.step(to_env(action))
         done = terminated | truncated
         for i in np.flatnonzero(done & (played < quota)):
@@ -2018,6 +2026,21 @@ def restrict_pool(options: EvaluateArgs, args: Args, table, pool, train_ids) -> 
     return np.sort(np.concatenate([shared, pool]))
 
 
+def favourites(tally: np.ndarray, labels: np.ndarray) -> str:
+    """What a policy plays, in words: tally (2, A) of `evaluate`, labels (A,).
+
+    The classes chosen most, with their share of what was chosen and of what was on offer: a policy
+    that has made up its mind chooses few of them far more often than they are on offer.
+    """
+    classes, index = np.unique(labels, return_inverse=True)
+    chosen, offered = (np.bincount(index, row) / row.sum() for row in tally)  # each (classes,)
+    top = np.argsort(-chosen, kind="stable")[:5]
+    words = (f"{classes[i]} {chosen[i]:.1%} (on offer {offered[i]:.1%})" for i in top)
+    action = tally[0].argmax()
+    most = f"most often {action} ({labels[action]}), {tally[0, action] / tally[0].sum():.1%}"
+    return f"chosen: {', '.join(words)}; {np.count_nonzero(tally[0])} different actions, {most}"
+
+
 def evaluate_run(options: EvaluateArgs) -> dict:
     """`python ppo_actiongen.py evaluate RUN ...`"""
     checkpoint = load_checkpoint(Path(options.run) / "best.pt", "cpu")
@@ -2048,11 +2071,12 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     preprocess.load(checkpoint["preprocess"])
     agent = Agent(preprocess.space, spaces[1], table, train_ids, args, Workers(1))
     agent.load_state_dict(checkpoint["agent"])
-    result = evaluate(
-        agent, preprocess, args, pool, options.episodes, options.seed, K, options.greedy
-    )
+    tally = np.zeros((2, len(table)), np.int64)
+    settings = options.episodes, options.seed, K, options.greedy
+    result = evaluate(agent, preprocess, args, pool, *settings, tally)
     print(f"{options.actions} actions, K={K}, {result['episodes']} episodes: ", end="")
     print(f"{result['score']:.4f} ± {result['stderr']:.4f} (pool of {len(pool)})")
+    print(favourites(tally, importlib.import_module(MODULES[args.env]).action_labels()))
     if options.save:
         path = Path(options.run) / "evaluations.csv"
         named = asdict(options) | {"num_available": K, "pool_size": len(pool)} | result

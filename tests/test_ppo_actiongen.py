@@ -736,7 +736,8 @@ def test_evaluate_a_saved_run(finished, monkeypatch, capsys):
     args = ["--num-available", "20", "--episodes", "41", "--actions", "valid"]
     monkeypatch.setattr(sys, "argv", ["ppo_actiongen.py", "evaluate", str(folder), *args])
     ppo.main()
-    assert "K=20, 41 episodes" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "K=20, 41 episodes" in said and "chosen: " in said and "different actions" in said
     for words, message in (
         (["--num-available", "257"], "257"),
         (["--num-available", "0"], "num_available 0 is not in 1..256"),
@@ -1232,6 +1233,31 @@ def test_pools_of_the_analyses():
     for bad in (dict(unseen_ratio=1.5), dict(min_embedding_distance="q7")):
         with pytest.raises(ValueError):
             pool(**bad)
+
+
+def test_the_tally_counts_what_was_chosen_and_what_was_on_offer():
+    tally = np.array([[6, 0, 2, 0], [8, 8, 8, 8]])
+    words = ppo.favourites(tally, np.array(["left", "left", "right", "none"]))
+    assert words == (
+        "chosen: left 75.0% (on offer 50.0%), right 25.0% (on offer 25.0%), none 0.0% (on offer "
+        "25.0%); 2 different actions, most often 0 (left), 75.0%"
+    )
+
+
+def test_the_tally_of_an_evaluation_is_that_of_its_episodes(tmp_path):
+    args = ppo.default_args("gridworld", "fast", False)
+    args = replace(args, representation="engineered", runs_dir=str(tmp_path))
+    run = ppo.Run(args)
+    run.envs.close()
+    pool, tally = run.pools["test"], np.zeros((2, gridworld.NUM_ACTIONS), np.int64)
+    played = [
+        ppo.evaluate(run.agent, run.preprocess, args, pool, 40, 3, 20, tally=t)
+        for t in (tally, None)
+    ]
+    assert played[0] == played[1]  # counting changes nothing
+    assert tally[0].sum() == round(40 * played[0]["length"])  # 40 environments, an episode each
+    assert tally[1].sum() == 20 * tally[0].sum() and (tally[0] <= tally[1]).all()
+    assert set(np.flatnonzero(tally[1])) <= set(pool)
 
 
 def test_saved_evaluations_replace_their_own_row(tmp_path, monkeypatch, capsys):
