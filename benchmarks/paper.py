@@ -177,6 +177,8 @@ for task in ("push", "seesaw"):
     RUNS[f"create-{task}"]["ours_clip"] = f"create --task {task} {AS_IS} --clip-coef 0.3"
 for task in MAIN_TASKS:
     RUNS[f"create-{task}"]["ours_early"] = f"create --task {task} {EARLY}"
+    # C.4 with the fast recipe: a tool's place can be learned before the choice has narrowed.
+    RUNS[f"create-{task}"]["ours_placed"] = f"create --task {task} --aux-conditioned"
 
 
 # ---- every figure and analysis: the runs it shows, and what they are tested with ----
@@ -202,6 +204,7 @@ class Experiment:
 BEYOND = {"ours_mlp_encoder", "ours_wide", "ours_outcome", "ours_bilinear"}
 BEYOND |= {"ours_paper_recipe"}  # the paper's, but with --recipe paper it is the same as "ours"
 BEYOND |= {"ours_fast", "engineered_fast", "ours_early", "ours_predicts", "ours_clip"}
+BEYOND |= {"ours_placed"}
 
 
 def methods_of(environment: str, *, beyond: bool = True) -> tuple[str, ...]:

@@ -50,6 +50,7 @@ METHODS = {
     "ours_fast": "Fast recipe",
     "engineered_fast": "Fast recipe, engineered",
     "ours_paper_recipe": "Paper's recipe",
+    "ours_placed": "Fast recipe, conditioned (C.4)",
     "ours_early": "Fast recipe in a hurry",
     "ours_predicts": "Ours, predicting outcomes",
     "ours_clip": "Ours, clip 0.3",

@@ -71,6 +71,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_paper_recipe",
             "engineered_fast",
             "ours_early",
+            "ours_placed",
             "ours_analysis",
         ):
             assert ppo_actiongen.method_name(args) == run.method, run.command
