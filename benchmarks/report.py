@@ -50,7 +50,6 @@ METHODS = {
     "ours_fast": "Fast recipe",
     "engineered_fast": "Fast recipe, engineered",
     "ours_paper_recipe": "Paper's recipe",
-    "ours_placed": "Fast recipe, conditioned (C.4)",
     "ours_early": "Fast recipe in a hurry",
     "ours_predicts": "Ours, predicting outcomes",
     "ours_clip": "Ours, clip 0.3",
@@ -66,6 +65,7 @@ METHODS = {
     "ours_finetuned": "Ours, fine-tuned",
     "discrete_from_scratch": "Discrete, from scratch",
     "discrete_finetuned": "Discrete, fine-tuned",
+    "ours_placed": "Fast recipe, conditioned (C.4)",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {
