@@ -65,7 +65,7 @@ METHODS = {
     "ours_finetuned": "Ours, fine-tuned",
     "discrete_from_scratch": "Discrete, from scratch",
     "discrete_finetuned": "Discrete, fine-tuned",
-    "ours_placed": "Fast recipe, conditioned (C.4)",
+    "ours_placed": "Fast recipe, C.4",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {
