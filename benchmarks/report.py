@@ -66,6 +66,7 @@ METHODS = {
     "discrete_from_scratch": "Discrete, from scratch",
     "discrete_finetuned": "Discrete, fine-tuned",
     "ours_placed": "Fast recipe, C.4",
+    "ours_one_split": "Fast recipe, one split",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {
