@@ -207,11 +207,17 @@ class Args:
     outcome_coef: float = 0.0
     """Weight of outcome_loss: what the chosen action led to (ours, method utility with utility mlp;
     paper: 0)."""
+    table_noise: float = 0.0
+    """While learning, representations are off by Gaussian noise of this many of the table's
+    standard deviations, another one in every rollout (ours, method utility; paper: 0)."""
 
     stop_bias: float = 0.0
     """Initial logit of going on, against stopping (ours; the paper: 0)."""
     aux_conditioned: bool = False
     """The position head also sees the chosen action (C.4)."""
+    aux_residual: bool = False
+    """With --aux-conditioned: the chosen action only corrects the position of D.3.2, at first by
+    next to nothing (ours)."""
 
     # Protocol
     eval_every: int = 410_000
@@ -597,6 +603,26 @@ class Workers:
         self.pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
 
 
+class CorrectedHead(nn.Module):
+    """A position head that the chosen action corrects: [code; projected action] (B, 2H) -> (B, d).
+
+    Ours, between D.3.2 and C.4: the linear head of D.3.2 on the code, plus the two layers of C.4,
+    whose last one starts near zero. C.4 alone starts with a random place for each action, and what
+    it then practises is the action whose random place happens to suit; this one starts with the
+    same place for all.
+    """
+
+    def __init__(self, H, d, generator):
+        super().__init__()
+        self.plain = layer_init(nn.Linear(H, d), 1.0, generator)
+        self.hidden = layer_init(nn.Linear(2 * H, H), 1.0, generator)
+        self.correction = layer_init(nn.Linear(H, d), 0.01, generator)
+
+    def forward(self, both):
+        code = both[:, : self.plain.in_features]  # (B, 2H) -> (B, H)
+        return self.plain(code) + self.correction(F.relu(self.hidden(both)))  # (B, d)
+
+
 class Agent(nn.Module):
     """State encoder, critic, utility (or a baseline's head) and auxiliary heads.
 
@@ -613,6 +639,7 @@ class Agent(nn.Module):
         # torch.tensor copies into aligned memory: matrix products may round differently elsewhere.
         self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
         self.register_buffer("train_ids", torch.tensor(train_ids))
+        self.noisy = None  # the table as the policy sees it during one rollout, see blur
         H, D = args.hidden_size, table.shape[1]
         W = args.utility_hidden or H
         self.encoder = StateEncoder(state_space, args, generator)
@@ -648,6 +675,8 @@ class Agent(nn.Module):
         """D.3.2: code -> d numbers; C.4: [code; projected action] -> hidden layer -> d numbers."""
         if not args.aux_conditioned:
             return layer_init(nn.Linear(H, d), 1.0, generator)
+        if args.aux_residual:
+            return CorrectedHead(H, d, generator)
         layers = nn.Linear(2 * H, H), nn.Linear(H, d)  # gains: published code
         first, last = (layer_init(layer, 1.0, generator) for layer in layers)
         return nn.Sequential(first, nn.ReLU(), last)
@@ -656,6 +685,28 @@ class Agent(nn.Module):
         """State (B, ...) -> code (B, H) and value (B,)."""
         code, critic_code = self.encoder(state)
         return code, self.critic(critic_code)[:, 0]
+
+    def blur(self, scale, seed):
+        """Let the policy see a noisy table from now on (scale 0: the table itself).
+
+        Ours. With a thousand training actions the utility can learn single ones by heart. Noise
+        leaves it what close actions have in common. One draw holds for a rollout and the update
+        that learns from it, so PPO's two probabilities are of the same policy; its seed is the
+        update's number, the same in every process and after --resume.
+        """
+        self.noisy = None
+        if scale:
+            noise = np.random.default_rng(seed).standard_normal(
+                (len(self.train_ids), self.table.shape[1]), np.float32
+            )  # (n, D)
+            codes = self.table[self.train_ids]  # (n, D)
+            off = scale * codes.std(0) * torch.as_tensor(noise, device=codes.device)
+            self.noisy = self.table.index_copy(0, self.train_ids, codes + off)  # (A, D)
+
+    @property
+    def codes(self):
+        """The representations (A, D) that the policy sees."""
+        return self.table if self.noisy is None else self.noisy
 
     def project_actions(self, ids=None):
         """P (A, W): the action half of the utility's hidden layer, for every action there is.
@@ -666,7 +717,7 @@ class Agent(nn.Module):
         """
         if self.method != "utility":
             return None
-        table = self.table if ids is None else self.table[ids]
+        table = self.codes if ids is None else self.codes[ids]
         if self.bilinear:
             return table  # (A, D)
         H = self.action_project.out_features
@@ -736,7 +787,7 @@ class Agent(nn.Module):
         stop_code = code  # C.4 conditions the position alone
         if self.has_position:
             if self.aux_conditioned:  # (B, H), (B, H) -> (B, 2H); the utility's own projection
-                code = torch.cat([code, self.action_project(self.table[taken])], dim=1)
+                code = torch.cat([code, self.action_project(self.codes[taken])], dim=1)
             # alpha, beta >= 1: a single peak, never piled up at both borders (D.3.2)
             alpha, beta = 1 + F.softplus(self.fc_alpha(code)), 1 + F.softplus(self.fc_beta(code))
             if action is None:
@@ -1528,7 +1579,7 @@ def check(args: Args) -> None:
     for name in ("clip_coef", "max_grad_norm", "encoder_rate"):
         if getattr(args, name) <= 0:
             raise ValueError(f"{name} {getattr(args, name)} is not above 0")
-    for name in ("vf_coef", "weight_decay", "aux_ent_scale"):
+    for name in ("vf_coef", "weight_decay", "aux_ent_scale", "table_noise"):
         if getattr(args, name) < 0:
             raise ValueError(f"{name} {getattr(args, name)} is not at least 0")
     if args.minibatch_size * args.num_minibatches < 2:
@@ -1557,6 +1608,10 @@ def check(args: Args) -> None:
         args.env not in ("create", "stacking") or args.placement == "none"
     ):
         raise ValueError("aux_conditioned: there is no position to choose here")
+    if args.aux_residual and not args.aux_conditioned:
+        raise ValueError("aux_residual needs aux_conditioned: it is about what that one adds")
+    if args.table_noise and args.method != "utility":
+        raise ValueError(f"table_noise needs method 'utility', not {args.method!r}")
     if args.device not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device {args.device!r} is not one of auto, cpu, cuda")
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -1836,6 +1891,7 @@ def train(args: Args) -> dict:
             param_group["lr"] = lr * param_group["rate"]
 
         # Collect, with a random subset of the training actions in every episode.
+        run.agent.blur(args.table_noise, seeds(args, 5, run.update_index))
         batch, obs, episodes = rollout(
             run.envs, obs, run.agent, run.preprocess, run.num_steps, run.generator, run.device,
             run.module.METRIC,
@@ -1846,6 +1902,7 @@ def train(args: Args) -> dict:
         # Learn, then let the normaliser catch up with what was seen.
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
         losses = update(run.agent, run.optimizer, batch, ent_coef, args, run.generator, run.device)
+        run.agent.blur(0, None)  # tests and checkpoints know the table as it is
         if not all(map(math.isfinite, losses.values())):
             raise ValueError(
                 f"after {run.update_index * run.batch_size} steps the loss is no number any more; "

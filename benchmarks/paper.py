@@ -179,6 +179,10 @@ for task in MAIN_TASKS:
     RUNS[f"create-{task}"]["ours_early"] = f"create --task {task} {EARLY}"
     # C.4 with the fast recipe: a tool's place can be learned before the choice has narrowed.
     RUNS[f"create-{task}"]["ours_placed"] = f"create --task {task} --aux-conditioned"
+    # Beyond C.4: the tool corrects its place, and the policy never sees the same table twice.
+    RUNS[f"create-{task}"]["ours_steady"] = (
+        f"create --task {task} --aux-conditioned --aux-residual --table-noise 0.5"
+    )
     # As published, and as anyone runs it who only says --seed: other seeds of training, one split.
     RUNS[f"create-{task}"]["ours_one_split"] = f"create --task {task} --split-seed 0"
 
@@ -206,7 +210,7 @@ class Experiment:
 BEYOND = {"ours_mlp_encoder", "ours_wide", "ours_outcome", "ours_bilinear"}
 BEYOND |= {"ours_paper_recipe"}  # the paper's, but with --recipe paper it is the same as "ours"
 BEYOND |= {"ours_fast", "engineered_fast", "ours_early", "ours_predicts", "ours_clip"}
-BEYOND |= {"ours_placed", "ours_one_split"}
+BEYOND |= {"ours_placed", "ours_steady", "ours_one_split"}
 
 
 def methods_of(environment: str, *, beyond: bool = True) -> tuple[str, ...]:

@@ -67,6 +67,7 @@ METHODS = {
     "discrete_finetuned": "Discrete, fine-tuned",
     "ours_placed": "Fast recipe, C.4",
     "ours_one_split": "Fast recipe, one split",
+    "ours_steady": "Fast recipe, noise, corrected place",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {

@@ -73,6 +73,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_early",
             "ours_placed",
             "ours_one_split",
+            "ours_steady",
             "ours_analysis",
         ):
             assert ppo_actiongen.method_name(args) == run.method, run.command

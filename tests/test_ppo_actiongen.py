@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -195,6 +196,38 @@ def test_exploring_mixes_in_uniform_choices_while_learning_only():
     assert torch.equal(
         agent.act(state, sets, P, noise, greedy=True)[0]["choice"], pi.argmax().expand(B)
     )
+
+
+def test_noise_moves_the_training_representations_by_its_share_of_their_spread():
+    args = replace(ppo.PRESETS["gridworld"], norm_obs=False)
+    table = np.random.default_rng(0).standard_normal((3000, 4)) * [0.1, 1, 10, 100]
+    agent = ppo.Agent(VECTOR, gym.spaces.Discrete(5), table, np.arange(2000), args, ppo.Workers(1))
+    agent.blur(0.5, 7)
+    off = (agent.codes - agent.table).numpy()
+    np.testing.assert_allclose(off[:2000].std(0), 0.5 * table[:2000].std(0), rtol=0.06)
+    assert abs(off[:2000] / table.std(0)).max() > 1 and not off[2000:].any()
+    same, other = (agent.codes.clone() for seed in (7, 8) if agent.blur(0.5, seed) is None)
+    np.testing.assert_array_equal((same - agent.table).numpy(), off)
+    assert not torch.equal(same, other)
+    agent.blur(0, 9)
+    assert agent.codes is agent.table and "noisy" not in agent.state_dict()
+
+
+@pytest.mark.parametrize("conditioned", [False, True])
+def test_a_rollout_and_its_update_see_the_same_noise(conditioned):
+    agent, _ = make_agent(HYBRID, aux_conditioned=conditioned)
+    state, sets = torch.randn(11, 7), random_sets(11, A=20)  # of the 20 it trains on
+    noise = torch.Generator().manual_seed(0)
+    plain = agent.project_actions()
+    agent.blur(0.5, 1)
+    P = agent.project_actions()
+    assert not torch.allclose(P[:20], plain[:20]) and torch.equal(P[20:], plain[20:])
+    action, logprob, _ = agent.act(state, sets, P, noise, learning=True)
+    code, few = agent.encode(state)[0], agent.project_actions(torch.arange(20))
+    torch.testing.assert_close(logprob, agent.logprob_entropy(code, sets, action, few)[0])
+    agent.blur(0, None)
+    other = agent.logprob_entropy(code, sets, action, agent.project_actions())[0]
+    assert not torch.allclose(logprob, other)
 
 
 def test_greedy_takes_the_mean_position_and_the_likelier_of_stop_and_go_on():
@@ -1085,11 +1118,54 @@ def test_conditioned_head_reproduces_the_log_probabilities_of_the_rollout():
     assert torch.allclose(again, logprob, atol=1e-5)
 
 
+def test_corrected_head_starts_as_the_plain_one_and_adds_what_the_action_says():
+    agent, _ = make_agent(HYBRID, aux_conditioned=True, aux_residual=True)
+    code, ids = torch.randn(7, 64), torch.arange(7)
+    projected = agent.action_project(agent.table[ids])
+    for head in (agent.fc_alpha, agent.fc_beta):
+        start = head.plain(code)
+        assert (head(torch.cat([code, projected], 1)) - start).abs().max() < 0.1 < start.std()
+        torch.nn.init.normal_(head.correction.weight)
+        for i in range(7):  # slow and obvious: one sample at a time
+            hidden = F.relu(head.hidden(torch.cat([code[i], projected[i]])))
+            expected = head.plain(code[i]) + head.correction(hidden)
+            both = torch.cat([code[i : i + 1], projected[i : i + 1]], 1)
+            torch.testing.assert_close(head(both)[0], expected, rtol=1e-4, atol=1e-5)
+
+
 def small(tmp_path, *extra):
     """A short Grid World run through main(); returns its folder's parent."""
     words = "--representation engineered --threads 1 --minibatch-size 64 --eval-every 256"
     words += " --valid-episodes 4 --eval-episodes 8 --no-tensorboard --total-timesteps 1024"
     return ["ppo", "gridworld", *words.split(), "--runs-dir", str(tmp_path), *extra]
+
+
+def test_a_noisy_run_goes_on_with_the_same_noise_and_is_tested_without(tmp_path, monkeypatch):
+    folders, update, evaluate, calls = [], ppo.update, ppo.evaluate, []
+
+    def interrupted(agent, *args):
+        calls.append(agent.noisy)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return update(agent, *args)
+
+    def noiseless(agent, *args, **kwargs):
+        assert agent.noisy is None
+        return evaluate(agent, *args, **kwargs)
+
+    monkeypatch.setattr(ppo, "evaluate", noiseless)
+    for name, do in (("whole", update), ("broken", interrupted)):
+        folders.append(tmp_path / name)
+        words = small(tmp_path, "--table-noise", "0.5", "--run-name", name)
+        monkeypatch.setattr(sys, "argv", words)
+        monkeypatch.setattr(ppo, "update", do)
+        with pytest.raises(KeyboardInterrupt) if do is interrupted else nullcontext():
+            ppo.main()
+    assert not torch.equal(calls[0], calls[1])  # another one in every rollout
+    monkeypatch.setattr(ppo, "update", update)
+    monkeypatch.setattr(sys, "argv", [*words, "--resume"])
+    ppo.main()
+    assert timeless(folders[0]) == timeless(folders[1]) and same_weights(*folders)
 
 
 @pytest.mark.parametrize("method", ["utility", "nearest-neighbor"])
@@ -1155,6 +1231,9 @@ def tyro_args(words):
         (["--finetune", "nowhere"], "no checkpoint"),
         (["--adapt", "--method", "continuous"], "continuous"),
         (["--aux-conditioned"], "no position"),
+        (["--aux-residual"], "aux_residual needs aux_conditioned"),
+        (["--table-noise", "-1"], "table_noise -1.0 is not at least 0"),
+        (["--table-noise", "1", "--method", "continuous"], "table_noise needs method 'utility'"),
     ],
 )
 def test_adaptation_refuses_with_one_line_and_leaves_nothing(tmp_path, extra, words, monkeypatch):
