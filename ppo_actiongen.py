@@ -1543,6 +1543,20 @@ def print_table(results: dict, metric: str) -> None:
 # ---- Algorithm 1: the training loop ----
 
 
+def check_actions_seen(args: Args) -> None:
+    """Raise ValueError where options about what the networks see of the actions do not fit."""
+    if args.aux_conditioned and (args.method, args.utility) != ("utility", "mlp"):
+        raise ValueError("aux_conditioned needs method 'utility' with utility 'mlp'")
+    if args.aux_conditioned and (
+        args.env not in ("create", "stacking") or args.placement == "none"
+    ):
+        raise ValueError("aux_conditioned: there is no position to choose here")
+    if args.aux_residual and not args.aux_conditioned:
+        raise ValueError("aux_residual needs aux_conditioned: it is about what that one adds")
+    if args.table_noise and args.method != "utility":
+        raise ValueError(f"table_noise needs method 'utility', not {args.method!r}")
+
+
 def check(args: Args) -> None:
     """Refuse impossible settings with one line, before anything is written."""
     positive = "num_available total_timesteps minibatch_size num_envs num_minibatches update_epochs"
@@ -1602,16 +1616,7 @@ def check(args: Args) -> None:
         raise ValueError(f"one_hot: the states of {args.env} are pictures")
     if args.adapt and args.method == "continuous":
         raise ValueError("adapt: method 'continuous' is not one of utility, nearest-neighbor")
-    if args.aux_conditioned and (args.method, args.utility) != ("utility", "mlp"):
-        raise ValueError("aux_conditioned needs method 'utility' with utility 'mlp'")
-    if args.aux_conditioned and (
-        args.env not in ("create", "stacking") or args.placement == "none"
-    ):
-        raise ValueError("aux_conditioned: there is no position to choose here")
-    if args.aux_residual and not args.aux_conditioned:
-        raise ValueError("aux_residual needs aux_conditioned: it is about what that one adds")
-    if args.table_noise and args.method != "utility":
-        raise ValueError(f"table_noise needs method 'utility', not {args.method!r}")
+    check_actions_seen(args)
     if args.device not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device {args.device!r} is not one of auto, cpu, cuda")
     if args.device == "cuda" and not torch.cuda.is_available():

@@ -66,8 +66,8 @@ METHODS = {
     "discrete_from_scratch": "Discrete, from scratch",
     "discrete_finetuned": "Discrete, fine-tuned",
     "ours_placed": "Fast recipe, C.4",
+    "ours_steady": "Fast recipe, steadied",
     "ours_one_split": "Fast recipe, one split",
-    "ours_steady": "Fast recipe, noise, corrected place",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {
