@@ -185,6 +185,9 @@ for task in MAIN_TASKS:
     )
     # As published, and as anyone runs it who only says --seed: other seeds of training, one split.
     RUNS[f"create-{task}"]["ours_one_split"] = f"create --task {task} --split-seed 0"
+    # The three analyses of a policy that gets further in the same steps.
+    analysis = VARIANTS["ours_analysis"]
+    RUNS[f"create-{task}"]["ours_analysis_fast"] = f"create --task {task} {analysis}"
 
 
 # ---- every figure and analysis: the runs it shows, and what they are tested with ----
@@ -210,13 +213,13 @@ class Experiment:
 BEYOND = {"ours_mlp_encoder", "ours_wide", "ours_outcome", "ours_bilinear"}
 BEYOND |= {"ours_paper_recipe"}  # the paper's, but with --recipe paper it is the same as "ours"
 BEYOND |= {"ours_fast", "engineered_fast", "ours_early", "ours_predicts", "ours_clip"}
-BEYOND |= {"ours_placed", "ours_steady", "ours_one_split"}
+BEYOND |= {"ours_placed", "ours_steady", "ours_one_split", "ours_analysis_fast"}
 
 
 def methods_of(environment: str, *, beyond: bool = True) -> tuple[str, ...]:
     """The methods of an environment's main comparison: all but variants and adaptation."""
     omit = set(ADAPT) | set(VARIANTS) - {"ours_video"} | {"ours_no_place", "ours_2d_place"}
-    omit |= set() if beyond else BEYOND
+    omit |= {"ours_analysis_fast"} if beyond else BEYOND
     return tuple(m for m in RUNS[environment] if m not in omit)
 
 
@@ -315,24 +318,24 @@ EXPERIMENTS |= {
     ),
     "analysis-angle": Experiment(
         "Analysis: tools at least so many degrees from every training tool of their class",
-        main_tasks("ours_analysis"),
+        main_tasks("ours_analysis", "ours_analysis_fast"),
         tests=tuple(f"{ANALYSIS} --min-angle-gap {gap}" for gap in (15, 12, 9, 6, 3)),
     ),
     # Published: absolute squared distances 0.5 .. 5, which depend on the scale of one encoder's
     # table. Here: quantiles of the unseen tools' squared distance to the nearest training tool.
     "analysis-embedding": Experiment(
         "Analysis: tools whose representation is far from those of all training tools",
-        main_tasks("ours_analysis"),
+        main_tasks("ours_analysis", "ours_analysis_fast"),
         tests=tuple(f"{ANALYSIS} --min-embedding-distance q0.{q}" for q in range(10)),
     ),
     "analysis-unseen-ratio": Experiment(
         "Analysis: share of unseen tools among those on offer",
-        main_tasks("ours_analysis"),
+        main_tasks("ours_analysis", "ours_analysis_fast"),
         tests=tuple(f"{ANALYSIS} --unseen-ratio {r / 5}" for r in range(6)),
     ),
     "analysis-set-size": Experiment(
         "Analysis: number of tools on offer",
-        main_tasks("ours", "ours_no_entropy", "ours_no_subsampling"),
+        main_tasks("ours", "ours_no_entropy", "ours_no_subsampling", "ours_fast"),
         tests=tuple(  # 1,000 episodes: published code
             f"--actions test --episodes 1000 --num-available {K}" for K in range(10, 61, 5)
         ),

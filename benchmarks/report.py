@@ -68,6 +68,7 @@ METHODS = {
     "ours_placed": "Fast recipe, C.4",
     "ours_steady": "Fast recipe, steadied",
     "ours_one_split": "Fast recipe, one split",
+    "ours_analysis_fast": "Fast recipe, 762 tools",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {
