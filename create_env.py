@@ -26,6 +26,7 @@ import math
 import multiprocessing
 import operator
 import os
+import zipfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -128,7 +129,7 @@ class Kind(NamedTuple):
     contact: Contact = Contact.PLAIN
     friction: float = 1.0  # the contact law multiplies: tool friction x ball friction (1)
     grey: int = 159  # observation; nominal grey of the published picture
-    colour: str = "#fa8535"  # human picture; published palette where it has one
+    colour: str = "#fa8535"  # human picture; close to the published palette
     sides: int = 0
     radius: float = 0.0  # half thickness of segments
 
@@ -307,12 +308,12 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
     The sets are disjoint except for the no-op (id 0), which is always on offer: as in the published
     arrays it counts once in train and once in the held-out half (here in test).
-    Raises ValueError for an unknown split or a negative seed.
+    Raises ValueError for an unknown split, or a seed that is no whole number from 0 on.
     """
     if split not in SPLITS:
         raise ValueError(f"unknown split {split!r}; allowed: {', '.join(SPLITS)}")
-    if seed < 0:
-        raise ValueError(f"seed must be 0 or more, got {seed}")
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed must be a whole number, 0 or more, got {seed!r}")
     rng = np.random.default_rng(seed)
     kinds, labels, values = (
         np.array([tool.kind for tool in TOOLS]),
@@ -349,12 +350,16 @@ def angle_gaps(action_ids: Sequence[int], train_ids: Sequence[int]) -> np.ndarra
     """Degrees to the nearest training tool of the same class, float64 (len(action_ids),).
 
     Angles wrap at the class's full turn (a ramp at 177 is 3 degrees from one at 0), see-saw limits
-    do not. A tool whose class has no training tool is infinitely far, the no-op 0 away.
+    do not. A tool whose class has no training tool is infinitely far, the no-op 0 away. Raises
+    ValueError for ids that do not exist.
     """
     # published code: compares with every class at once and without wrapping, so that 345 is 345
     # from 0.
     kinds, values = np.array([tool.kind for tool in TOOLS]), primary_values()
     ids, train_ids = np.asarray(action_ids, np.int64), np.asarray(train_ids, np.int64)
+    for some in (ids, train_ids):
+        if some.size and (some.min() < 0 or some.max() >= NUM_ACTIONS):
+            raise ValueError(f"ids must be 0..{NUM_ACTIONS - 1}, got {some.min()}..{some.max()}")
     gaps = np.full(len(ids), np.inf)
     for kind in np.unique(kinds[ids]):
         here, known = kinds[ids] == kind, values[train_ids[kinds[train_ids] == kind]]
@@ -882,7 +887,7 @@ def grey_strokes(thing: Thing) -> tuple:
     """
     # published code: aliased flat shapes and rotated PNGs squeezed into boxes, in a palette of 8
     # bits, the whole picture mirrored left to right; we draw it upright, flat shapes
-    # with soft edges (a move of a tenth of a unit is visible) at the same nominal greys.
+    # with soft edges (a move of an eighth of a unit is visible) at the same nominal greys.
     tool, kind, grey, corners = thing.tool, thing.kind, thing.kind.grey, thing.corners
     x, y, angle = thing.pose()
     aim = math.radians(tool.angle)
@@ -1108,12 +1113,15 @@ class CreateEnv(gymnasium.Env):
         tool_cost: float = 0.0,
         render_size: int = 420,
     ):
-        if task not in TASKS:
+        if not isinstance(task, str) or task not in TASKS:
             raise ValueError(f"unknown task {task!r}; allowed: {', '.join(TASKS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}; allowed: None, 'rgb_array'")
-        if not (isinstance(tool_cost, float | int) and 0 <= tool_cost < math.inf):
-            raise ValueError(f"tool_cost must be 0 or more, got {tool_cost!r}")
+        if not isinstance(subgoal_reward, bool | np.bool_):
+            raise ValueError(f"subgoal_reward must be True or False, got {subgoal_reward!r}")
+        number = isinstance(tool_cost, float | int | np.floating | np.integer)
+        if not (number and 0 <= tool_cost < math.inf):
+            raise ValueError(f"tool_cost must be a finite number, 0 or more, got {tool_cost!r}")
         if not isinstance(render_size, int | np.integer) or render_size < 84:
             raise ValueError(f"render_size must be a whole number, 84 or more, got {render_size}")
         self._tools_on_offer = check_pool(action_pool, num_available)
@@ -1154,7 +1162,7 @@ class CreateEnv(gymnasium.Env):
         return self._observe(), {}
 
     def _build_level(self) -> None:
-        """A fresh space with the task's objects, in the published order."""
+        """A fresh space with the task's objects; the picture of all that stands still."""
         task, rng = self.task, self.np_random
         shift = {name: [rng.uniform(*r) for r in ranges] for name, ranges in task.shifts.items()}
         shift[""] = (0.0, 0.0)
@@ -1269,7 +1277,8 @@ class CreateEnv(gymnasium.Env):
             far = _screen_distance(self._target.pose()[:2], self._start) > HIT_DISTANCE
             if far and (self._marker.touched or not self.task.marker_must_hit):
                 self._target_hit = moved = True
-        # published code: tests the goal before target-hit, so a goal in the same action is lost
+        # published code: tests the goal before target-hit, so a goal in the same action counts one
+        # action later, or never if the episode ends first
         if self._target_hit and self._goal.touched:
             self._goal_hit = True
         # published code: a subgoal counts if touched at the end of an action; we: at any time in it
@@ -1293,7 +1302,9 @@ class CreateEnv(gymnasium.Env):
             reward += LAMBDA_INVALID
         if goal:
             reward += LAMBDA_GOAL - cost
-        if self.subgoal_reward:  # C.3; the published option also drops the target-hit reward
+        # C.3 names subgoals; push has none and was run without them all the same, so the reward for
+        # the target hit must have been meant too.
+        if self.subgoal_reward:
             reward += subgoals * max(0.0, LAMBDA_SUBGOAL - cost)
             reward += target_moved * self.task.target_hit_reward
         return reward
@@ -1421,8 +1432,9 @@ def make_vec(
     of cores (None). Both give the same bytes. Environment i starts from seed + i; `reset()` without
     a seed continues from there, `reset(seed=s)` reseeds with s + i. ValueErrors as `CreateEnv`.
     """
-    if num_envs < 1 or seed < 0:
-        raise ValueError(f"num_envs must be 1 or more and seed 0 or more, got {num_envs}, {seed}")
+    for name, value, least in (("num_envs", num_envs, 1), ("seed", seed, 0)):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
     CreateEnv(action_pool, num_available, **task_options)  # fail here, not in a worker
 
     def make(index: int) -> CreateEnv:
@@ -1498,7 +1510,7 @@ def action_observations(
     for name, value, least in limits:
         if not isinstance(value, int | np.integer) or value < least:
             raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
-    ids = ids.astype(np.int64)
+    ids, num_observations, seed = ids.astype(np.int64), int(num_observations), int(seed)
     states = _cached_states(ids, num_observations, seed, workers, cache)  # (ids, n, 7, 7)
     if modality == "xy":
         return np.ascontiguousarray(states[..., 2:4])
@@ -1538,9 +1550,13 @@ def _cached_states(ids, n: int, seed: int, workers: int, cache) -> np.ndarray:
         fingerprint += b"".join(_probe_states((i, 4, 0)).tobytes() for i in firsts.values())
         digest = hashlib.sha256(fingerprint).hexdigest()[:16]
         path = Path(cache) / f"create-probe-n{n}-s{seed}-{digest}.npz"
-        if path.exists():
+        try:
             with np.load(path, allow_pickle=False) as stored:
                 known = dict(zip(stored["ids"].tolist(), stored["states"], strict=True))
+        except FileNotFoundError:
+            pass
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as e:
+            print(f"{path} is damaged ({e}): its trajectories are recorded again", flush=True)
     missing = [action for action in dict.fromkeys(ids.tolist()) if action not in known]
     jobs = [(action, n, seed) for action in missing]
     known.update(zip(missing, _spread(_probe_states, jobs, workers, "probe ball"), strict=True))

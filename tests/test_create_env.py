@@ -356,6 +356,166 @@ def test_untouched_balls_are_gone_after_seven_actions(task):
     assert info["episode"]["r"] == pytest.approx(0.07)
 
 
+# The 12 levels once more, typed from the published task files independently of `c.TASKS`: kind,
+# place (norm), size (units), angle (degrees), what else it has, half the range of its shift (norm).
+NO, BALL = 0.0, (10, 1.0)  # of a ball: mass and elasticity
+LEVELS = {
+    "push": [
+        ("Marker", 0.6, 0.75, 4, 0, BALL, 0.2),
+        ("Thin line", 0.1, -0.25, 16, 0, NO, 0.2),
+        ("Thin line", -0.7, -0.75, 16, 0, NO, 0.2),
+        ("Target", 0.1, -0.14, 4, 0, BALL, 0.2),
+        ("Goal star", -0.7, -0.64, 4, 90, NO, 0.2),
+    ],
+    "navigate": [
+        ("Marker", -0.6, 0.75, 4, 0, BALL, 0),
+        ("Thin line", 0.1, -0.35, 16, 0, NO, 0.1),
+        ("Thin line", -0.65, -0.7, 16, 0, NO, 0.2),
+        ("Thin line", -0.5, 0.1, 40, 0, NO, 0),
+        ("Target", 0.1, -0.24, 4, 0, BALL, 0.1),
+        ("Goal star", -0.65, -0.59, 4, 90, NO, 0.2),
+    ],
+    "obstacle": [
+        ("Marker", -0.8, 0.8, 4, 0, BALL, 0.02),
+        ("Thin line", -0.61, 0.39, 35.6, -30, NO, 0),
+        ("Thin line", -0.25, 0.04, 12.7, 90, NO, 0),
+        ("Thin line", 0.07, -0.1, 26, 0, NO, 0),
+        ("Thin line", -0.8, -0.81, 16, 0, NO, 0),
+        ("Thin line", 0.12, -0.59, 16, 0, NO, 0),
+        ("Thin line", -0.34, -0.7, 24.5, 22.5, NO, 0),
+        ("Box", -0.7, 0.3, 5, 0, (30, 0.1), 0),
+        ("Box", -0.7, 0.2, 5, 0, (30, 0.1), 0),
+        ("Thin line", -0.6, 0.18, 15, 90, NO, 0),
+        ("Thin line", -0.8, 0.18, 15, 90, NO, 0),
+        ("Thin line", 0.35, 0.8, 15, 90, NO, 0),
+        ("Box", 0.25, 0.93, 5, 0, (30, 0.1), 0),
+        ("Box", 0.25, 0.83, 5, 0, (30, 0.1), 0),
+        ("Thin line", 0.15, 0.8, 15, 90, NO, 0),
+        ("Target", 0.1, -0.47, 4, 0, BALL, ((-0.02, 0.02), (0, 0))),
+        ("Goal star", -0.9, -0.69, 4, 90, NO, 0),
+    ],
+    "seesaw": [
+        ("Heavy ball", -0.3, 0.5, 4, 0, (30, 0.1), 0.05),
+        ("See-saw", -0.3, -0.1, 30, 0, (30, 1, True), 0),  # limit, weight, its left end is up
+        ("Thin line", 0.1, -0.7, 40, 90, NO, 0),
+        ("Thin line", -0.9, -0.3, 20, 0, NO, 0),
+        ("Target", 0.2, 0.9, 4, 0, BALL, 0.1),
+        ("Goal star", -0.8, -0.8, 4, 90, NO, 0),
+    ],
+    "belt": [
+        ("Conveyor Belt", 0.55, 0.25, 7, 0, -2.5, 0),  # of belts and ladders: speed
+        ("Conveyor Belt", 0.05, 0.2, 7, 0, -2.5, 0),
+        ("Conveyor Belt", -0.3, -0.6, 7, 0, 5, 0),
+        ("Line", 0.41, -0.3, 65, 0, NO, 0),
+        ("Line", -0.34, -0.17, 12.7, 90, NO, 0),
+        ("Target", 0.75, 0.75, 3, 0, BALL, 0.1),
+        ("Goal star", 0.5, -0.7, 4, 90, NO, 0.1),
+    ],
+    "buckets": [
+        ("Thin line", -0.48, -0.99, 45, 0, NO, 0),
+        ("Thin line", -0.75, -0.15, 25, 0, NO, 0),
+        ("Thin line", -0.99, -0.7, 45, 90, NO, 0),
+        ("Thin line", 0.05, -0.7, 45, 90, NO, 0),
+        ("Bucket", 0.05, -0.1, 4, 0, NO, 0),
+        ("Bucket", -0.45, -0.1, 4, 0, NO, 0),
+        ("Target", 0.75, 0.75, 3, 0, BALL, 0.1),
+        ("Goal star", -0.85, -0.85, 4, 90, NO, 0),
+    ],
+    "cannon": [
+        ("Marker", 0.8, 0.75, 4, 0, BALL, 0.1),
+        ("Thin line", -0.1, 0.35, 55, 90, NO, 0),
+        ("Cannon", -0.1, -0.8, 0, 110, 140, 0),  # force
+        ("Thin line", 0.4, 0, 8, 0, NO, 0.05),
+        ("Target", 0.4, 0.11, 4, 0, BALL, 0.05),
+        ("Goal star", -0.7, -0.1, 4, 90, NO, 0.05),
+    ],
+    "collide": [
+        ("Thin line", 0, 0.25, 35, 90, NO, 0),
+        ("Target", 0.6, 0.7, 4, 0, BALL, 0.1),
+        ("Goal ball", -0.6, 0.7, 4, 0, BALL, 0.1),
+    ],
+    "moving": [
+        ("Trampoline", -0.7, -0.75, 16, 0, NO, 0),
+        ("Target", 0.6, 0.75, 4, 0, BALL, 0.2),
+        ("Goal ball", -0.7, 0, 4, 0, BALL, ((0, 0), (-0.5, 0.5))),
+    ],
+    "ladder": [
+        ("Marker", 0.7, 0.75, 4, 0, BALL, 0),
+        ("Thin line", 0.35, -0.2, 5, 0, NO, 0.1),
+        ("Thin line", -0.75, -0.2, 5, 0, NO, 0.2),
+        ("Ladder", -0.1, -0.1, 20, 95, 4, 0),
+        ("Target", 0.35, -0.09, 4, 0, BALL, 0.1),
+        ("Goal star", -0.75, -0.09, 4, 90, NO, 0.2),
+    ],
+    "basket": [
+        ("Ladder", 0.5, -0.4, 15, 95, 4, 0),
+        ("Ladder", -0.05, 0, 15, 95, 4, 0),
+        ("Ladder", -0.55, 0.35, 15, 95, 4, 0),
+        ("Basketball", 0.75, 0.75, 3.5, 0, BALL, 0.1),
+        ("Basket", -0.75, 0.65, 10, 0, NO, 0.1),
+    ],
+    "funnel": [
+        ("Thin line", -0.56, -0.99, 35.5, 0, NO, 0),
+        ("Thin line", -0.88, -0.16, 10, 0, NO, 0),
+        ("Thin line", -0.257, -0.16, 10, 0, NO, 0),
+        ("Thin line", -0.99, -0.7, 45, 90, NO, 0),
+        ("Thin line", -0.15, -0.7, 45, 90, NO, 0),
+        ("Funnel", -0.6, -0.15, 8, -45, NO, 0),
+        ("Thin line", 0.56, -0.99, 35.5, 0, NO, 0),
+        ("Thin line", 0.88, -0.16, 10, 0, NO, 0),
+        ("Thin line", 0.257, -0.16, 10, 0, NO, 0),
+        ("Thin line", 0.99, -0.7, 45, 90, NO, 0),
+        ("Thin line", 0.15, -0.7, 45, 90, NO, 0),
+        ("Funnel", 0.6, -0.15, 8, 45, NO, 0),
+        ("Target", 0, 0.9, 4, 0, BALL, ((-0.2, 0.05), (-0.2, 0.05))),
+        ("Goal star", -0.28, -0.8, 4, 90, NO, 0),
+    ],
+}
+# Subgoals, boundary, actions, whether the marker must touch the target, reward of the target hit.
+RULES = {
+    "obstacle": ({(0.7, -0.1)}, "RLC", 50, True, 2.0),
+    "seesaw": ({(-0.1, -0.45)}, "RLC", 30, False, 1.0),
+    "belt": ({(-0.6, -0.35), (-0.15, 0.28), (-0.1, -0.5)}, "", 50, False, 1.0),
+    "buckets": ({(-0.2, -0.1)}, "", 30, False, 1.0),
+    "cannon": (set(), "RC", 30, True, 1.0),
+    "collide": (set(), "RLC", 30, False, 1.0),
+    "basket": ({(0.35, -0.05), (-0.15, 0.35)}, "", 40, False, 1.0),
+}
+
+
+def peculiar(tool: Tool):
+    """What a level object has beside its size and angle."""
+    if c.KINDS[tool.kind].family in ("ball", "crate"):
+        return tool.mass, tool.elasticity
+    if tool.kind == "See-saw":
+        return tool.max_angle, tool.mass, tool.on_left
+    return tool.speed or tool.force
+
+
+@pytest.mark.parametrize("task", list(c.TASKS))
+def test_level_is_the_published_one(task):
+    level, still = c.TASKS[task], ((0.0, 0.0), (0.0, 0.0))
+    items = [*level.items, level.target, level.goal]
+    assert len(items) == len(LEVELS[task])
+    for item, (*expected, shift) in zip(items, LEVELS[task], strict=True):
+        tool = item.tool
+        found = [tool.kind, item.x, item.y, tool.size, tool.angle, peculiar(tool)]
+        if tool.kind == "Thin line":  # vertical lines look the same either way up
+            found[4] = abs(tool.angle) if abs(tool.angle) == 90 else tool.angle
+        assert found == expected
+        ranges = shift if isinstance(shift, tuple) else ((-shift, shift),) * 2
+        assert level.shifts.get(item.shift, still) == ranges, tool.kind
+        if tool.kind == "Trampoline":
+            assert tool.elasticity == 1.0
+    found = set(level.subgoals), level.boundary, level.max_actions, level.marker_must_hit
+    assert (*found, level.target_hit_reward) == RULES.get(task, (set(), "", 30, False, 1.0))
+    assert level.goal_on_either_side == (task == "funnel")
+    # What shares a shift stays together: the shelf below a target or a star.
+    shared = [item.shift for item in items if item.shift]
+    pairs = {"push": 2, "navigate": 2, "cannon": 1, "ladder": 2}.get(task, 0)
+    assert len(shared) - len(set(shared)) == pairs
+
+
 def test_untouched_navigate_comes_to_rest_after_twelve_actions():
     assert play_no_op("navigate")["episode"]["l"] == 12
 
@@ -729,6 +889,8 @@ def test_vector_reset_with_a_seed_reseeds():
 
 BAD_ARGUMENTS = [
     ({"task": "pull"}, "unknown task 'pull'"),
+    ({"task": ["push"]}, r"unknown task \['push'\]"),
+    ({"subgoal_reward": "no"}, "subgoal_reward must be True or False, got 'no'"),
     ({"action_pool": [0, 1, 2], "num_available": 4}, "num_available must be an integer in 1..3"),
     ({"action_pool": [1, 2], "num_available": 4}, "num_available must be an integer in 1..3"),
     ({"num_available": 0}, "num_available must be"),
@@ -749,6 +911,12 @@ def test_bad_arguments(arguments, message):
         CreateEnv(**arguments)
     with pytest.raises(ValueError, match=message):
         c.make_vec(2, **{"seed": 0, "async_envs": True, **arguments})
+
+
+@pytest.mark.parametrize("num_envs, seed", [(0, 0), (1.5, 0), ("2", 0), (2, -1), (2, None)])
+def test_bad_numbers_of_environments_and_seeds(num_envs, seed):
+    with pytest.raises(ValueError, match="must be a whole number"):
+        c.make_vec(num_envs, seed=seed)
 
 
 BAD_ACTIONS = [
@@ -989,6 +1157,18 @@ def test_cache_gives_the_same_bytes_and_grows(tmp_path, monkeypatch):
         c.action_observations([20, 3], 10, cache=tmp_path)
 
 
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut off"])
+def test_damaged_cache_is_made_again(tmp_path, monkeypatch, capsys, damage):
+    monkeypatch.setattr(c, "CACHE_FROM", 1)
+    first = c.action_observations([3], 10, cache=tmp_path)
+    (path,) = tmp_path.glob("*.npz")
+    path.write_bytes(damage)
+    again = c.action_observations([3], np.int64(10), cache=tmp_path)  # the same file
+    assert np.array_equal(first, again) and list(tmp_path.iterdir()) == [path]
+    assert f"{path} is damaged" in capsys.readouterr().out
+    assert np.load(path, allow_pickle=False)["ids"].tolist() == [3]
+
+
 def test_probe_video():
     ids = [find_tool("Ball", size=9), find_tool("See-saw"), 0]
     states = c.action_observations(ids, 3, "state", cache=None)
@@ -1021,8 +1201,16 @@ def test_bad_observation_requests(arguments):
 def test_bad_splits():
     with pytest.raises(ValueError, match="unknown split 'half'"):
         c.split_actions("half")
-    with pytest.raises(ValueError, match="seed"):
-        c.split_actions("default", -1)
+    for seed in (-1, 1.5, None):
+        with pytest.raises(ValueError, match="seed"):
+            c.split_actions("default", seed)
+
+
+def test_angle_gaps_of_ids_that_do_not_exist():
+    with pytest.raises(ValueError, match="ids must be 0.."):
+        c.angle_gaps([-1], [0, 5])
+    with pytest.raises(ValueError, match="ids must be 0.."):
+        c.angle_gaps([1], [c.NUM_ACTIONS])
 
 
 # ---- the command ----
