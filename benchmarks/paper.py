@@ -95,7 +95,7 @@ RUNS: dict[str, dict[str, str]] = {
         "oracle_encoder_all_actions": f"{LSTM} --representation hvae-all",
         "non_hierarchical_vae": f"{LSTM} --representation vae",
         "ours_no_entropy": f"{LSTM} --ent-coef 0",
-        # Ten times the cost per step of the others, so a still narrower utility and fewer steps.
+        # Each step costs several times the others', so a still narrower utility and fewer steps.
         "ours_no_subsampling": f"gridworld --hidden-size 64 --utility-hidden 64 {PLAIN} "
         "--hvae-recipe lstm --no-subsample --budget 0.2",
         "nearest_neighbor": f"{LSTM} --method nearest-neighbor",

@@ -152,8 +152,8 @@ RECIPE_NOTE = {
     "gridworld-recipe": "Engineered representation. Rows 2 to 4 add up: each keeps what those "
     "above it have undone. Every later row undoes one thing more, starting from row 4 (networks "
     "half as wide): compare it with that one",
-    "create-recipe": "Learned representation; the second row pays later (2M steps above), and each "
-    "one below it keeps what it has undone",
+    "create-recipe": "Learned representation; what the second row undoes pays later (2M steps, "
+    "see *What we learned in CREATE*), and each row below it keeps what it has undone",
 }
 
 
@@ -440,7 +440,7 @@ def overview(experiment: str) -> str:
                 text = with_budget(text, ours[env], method, usual[env])
             cells.append(text)
         lines.append("| " + " | ".join(cells) + " |")
-    note = note_on_brackets(lines, "published (more steps, see below)")
+    note = note_on_brackets(lines, "published (more steps, see the first table of Results)")
     return "\n".join(lines) + (
         f"\n\nUnseen actions{note} Without ±: one seed. Other numbers of steps stand by the score."
     )
