@@ -265,7 +265,8 @@ def resolve(args: Args) -> Args:
     if preset.get("linear_path") and not args.hierarchical:  # no c, no path to it
         preset |= dict(linear_path=False)
         if modality != "video":  # ... so learn longer
-            preset |= dict(updates=RECIPES["mlp"]["updates"])
+            longer = "quick" if args.recipe == "quick" else "mlp"
+            preset |= dict(updates=RECIPES[longer]["updates"])
     if args.epochs and args.updates:
         raise ValueError("epochs and updates: give one of them")
     if args.epochs:
@@ -413,8 +414,8 @@ def undo(output: np.ndarray, first: np.ndarray, fmt: Format) -> np.ndarray:
 class Residual(nn.Module):
     """`layers` linear layers with ReLU between them, then ReLU(out + input).
 
-    appendix: "MLP"; published code: such residual blocks, with the appendix's numbers of layers; we
-    do as the code.
+    appendix: "MLP"; published code: such residual blocks, with the appendix's numbers of layers but
+    for one (ActionInference); we do as the code.
     """
 
     def __init__(self, width: int, layers: int):
@@ -823,7 +824,8 @@ class VAE(ObservationModel):
 
     published code: a quarter of the HVAE's updates and another initialisation; we give both models
     the same batches, updates and initialisation, so that only the hierarchy differs. (Where the
-    HVAE's recipe has a linear path, which the VAE cannot have, that gets more updates: `resolve`.)
+    HVAE's recipe in Grid World has a linear path, which the VAE cannot have, that gets more
+    updates: `resolve`.)
     """
 
     def __init__(self, fmt: Format, args: Args):
@@ -932,10 +934,13 @@ def embed(
     device = next(model.parameters()).device
     model.eval()  # running statistics: a representation does not depend on its neighbours
     tables = np.zeros((2, module.NUM_ACTIONS, args.representation_size), np.float32)
-    chunk = 128 if model.format.visual else len(ids)  # videos of all tools would not fit in memory
+    chunk = len(ids)
+    if model.format.visual:  # pictures of all actions would not fit in memory
+        chunk = min(128, max(1, 40_000 // args.table_observations))
     for some in np.array_split(ids, -(-len(ids) // chunk)):
         raw = observe(module, some, args.table_observations, args)
-        for part in np.array_split(np.arange(len(some)), -(-raw.size // 4_000_000)):
+        parts = min(len(some), -(-raw.size // 4_000_000))
+        for part in np.array_split(np.arange(len(some)), parts):
             table = model.represent(torch.from_numpy(raw[part]).to(device))
             tables[:, some[part]] = torch.stack(table).cpu().numpy()
     return tables[0], tables[1]
@@ -955,10 +960,14 @@ def train(args: Args) -> Path:
     ids = pool if args.train_on == "all" else split["train"]
     cuda = torch.cuda.is_available()
     device = ("cuda" if cuda else "cpu") if args.device == "auto" else args.device
-    if device != "cpu" and not (cuda and device.startswith("cuda")):
+    try:
+        if device != "cpu" and not (cuda and device.startswith("cuda")):
+            raise RuntimeError
+        torch.empty(0, device=device)  # cuda:7 where there is no eighth
+    except (RuntimeError, AssertionError):
         raise ValueError(
             f"device {device!r} is not available; allowed: auto, cpu, cuda (with a GPU)"
-        )
+        ) from None
     try:  # now, not after the training: can files with the longest of the names be written?
         path.parent.mkdir(parents=True, exist_ok=True)
         longest = path.with_name(f".{os.getpid()}-{path.stem}-reconstructions.png")
@@ -970,15 +979,23 @@ def train(args: Args) -> Path:
     torch.set_num_threads(args.threads)
     keep_memory()
     try:
-        with torch.random.fork_rng():  # the caller's random numbers stay as they are
+        gpus = [] if device == "cpu" else [torch.device(device).index or 0]
+        with torch.random.fork_rng(gpus):  # the caller's random numbers stay as they are
             torch.manual_seed(args.seed)
             data = observe(module, ids, args.observations, args)  # training actions only
             fmt = Format.of(args.env, args.modality, data.shape, args.relative)
             model = (HVAE if args.hierarchical else VAE)(fmt, args).to(device)
             rows = fit(model, data, args)
+        save_training(model, rows, path)  # now: what embed reads may be too much for the machine
         mean, log_var = embed(model, module, pool, args)
     finally:
         torch.set_num_threads(threads)
+    report(model, module, mean, path, args)
+    return save_representation(path, args.env, mean, log_var, ids, settings(args))
+
+
+def save_training(model: ObservationModel, rows: list[dict], path: Path) -> None:
+    """Write the losses (.csv) and the weights (.pt) beside where the table will be."""
     write_atomically(path.with_suffix(".csv"), lambda file: write_csv(file, rows))
     weights = {name: value.cpu() for name, value in model.state_dict().items()}
 
@@ -987,12 +1004,13 @@ def train(args: Args) -> Path:
             torch.save(weights, file)
 
     write_atomically(path.with_suffix(".pt"), save)
-    report(model, module, mean, path, args)
-    return save_representation(path, args.env, mean, log_var, ids, settings(args))
 
 
 def settings(args: Args) -> dict:
-    """What of `args` is written into the table: all that decides its content."""
+    """What of `args` is written into the table: all that decides its content.
+
+    But for the device: a GPU draws other random numbers, and so makes another table as good.
+    """
     omit = ("env", "runs_dir", "plots", "workers", "device")
     return {key: value for key, value in asdict(args).items() if key not in omit}
 
@@ -1089,7 +1107,9 @@ def save_representation(
     """
     module, path = load_environment(env), Path(path)
     table = dict(mean=np.asarray(mean, np.float32), log_var=np.asarray(log_var, np.float32))
-    table["action_ids"] = np.asarray(action_ids, np.int64)
+    table["action_ids"] = np.asarray(action_ids)
+    if not table["action_ids"].size or table["action_ids"].dtype.kind in "iu":  # 1.7 is no id
+        table["action_ids"] = table["action_ids"].astype(np.int64)
     check_table(table, module.NUM_ACTIONS, str(path))
     config = dict(config or {}, environment=env, fingerprint=fingerprint(module))
     table["config"] = np.array(json.dumps(config, sort_keys=True))
@@ -1406,10 +1426,10 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     try:
         print(f"representations: {train(args)}")
-    except (ValueError, OSError, MemoryError) as e:
+    except (ValueError, OSError, MemoryError, ImportError) as e:
         raise SystemExit(f"error: {e}") from None
-    except RuntimeError as e:  # torch has no error of its own for too little memory
-        if "memory" not in str(e):
+    except RuntimeError as e:  # too little memory has an error of its own only on a GPU
+        if not isinstance(e, torch.OutOfMemoryError) and "allocate memory" not in str(e):
             raise
         raise SystemExit(f"error: {str(e).splitlines()[0]}") from None
 

@@ -91,8 +91,8 @@ REST_DEPTH = 0.01  # ours: at rest, two bodies overlap by less; an eighth of the
 
 # ---- pictures ----
 FOV = 45.0  # published code, degrees
-# published code: eye and target; right = +x, floor z = 0. The picture ends at a height of 5.4 (2D
-# Place: 3.9), so that the policy does not see the top of its best towers.
+# published code: eye and target, here mirrored to the -y side; right = +x, floor z = 0. The picture
+# ends at a height of 5.4 (2D Place: 3.9): the policy does not see the top of its best towers.
 FRONT = (0.0, -7.0, 2.5), (0.0, 0.0, 2.5)
 RAISED = (0.0, -4.0, 5.5), (0.0, 1.66, 0.0)  # the same for 2D Place
 VIEW_RADIUS, VIEW_HEIGHT = 2.0, (0.5, 2.0)  # published code: a circle around the shape, and heights
@@ -606,7 +606,10 @@ def _gray(canvas: Canvas, grays: np.ndarray) -> np.ndarray:
 
 
 def _views(shape_id: int, num_views: int, seed: int) -> np.ndarray:
-    """Pictures of one shape from random viewpoints, (num_views, 84, 84) uint8."""
+    """Pictures of one shape from random viewpoints, (num_views, 84, 84) uint8.
+
+    published code: 1,024 views of which 32 differ, in colour; here all are independent, and grey.
+    """
     shape, solid = SHAPES[shape_id], SOLIDS[shape_id]
     # each shape has its own generator and each view its own two numbers: the first n views are the
     # same however many are asked for, and whoever else is asked for
@@ -661,6 +664,7 @@ def action_observations(
 
     Raises:
         ValueError: unknown id or modality, a number below 1, or a negative seed.
+        OSError: the disk has no room for the file.
     """
     ids = check_ids(action_ids)
     if modality not in MODALITIES:
@@ -680,6 +684,11 @@ def action_observations(
         part = path.with_name(f"{path.name}.{os.getpid()}.part")
         try:
             out = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
+            # A map may be larger than what the disk has left, and running into that kills the
+            # process. Asking for the room now is an OSError instead.
+            if hasattr(os, "posix_fallocate"):
+                with open(part, "r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, part.stat().st_size)
             _fill(out, ids, seed, workers)
             out.flush()
             os.replace(part, path)  # a broken-off run leaves no half-written file behind
@@ -859,7 +868,8 @@ class StackingEnv(gym.Env):
         self._trace = []
         self._steps += 1
         shape_id = int(self.available[choice])
-        if not stop and shape_id not in self._placed:  # A.4: trying to place it again does nothing
+        # A.4: trying to place it again does nothing (published code: the simulation goes on)
+        if not stop and shape_id not in self._placed:
             self._placed.add(shape_id)
             self._drop(shape_id, x, y)
             self._picture = self._draw()
@@ -960,7 +970,10 @@ class StackingEnv(gym.Env):
         self.shape_ids.append(shape_id)
 
     def _drop(self, shape_id: int, x: float, y: float) -> None:
-        """A.4: let a shape go just above "the topmost shape, enabling a soft drop"."""
+        """A.4: let a shape go just above "the topmost shape, enabling a soft drop".
+
+        published code: above it by the radii of their bounding spheres.
+        """
         for body in self._bodies:  # published code: everything stands still when a shape is added
             self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=self._client)
         self._add(shape_id, x, y, lowest_z=self.top() + DROP_GAP)

@@ -76,6 +76,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_steady",
             "ours_analysis",
             "ours_analysis_fast",
+            "ours_gains",
         ):
             assert ppo_actiongen.method_name(args) == run.method, run.command
 

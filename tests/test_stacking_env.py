@@ -1,7 +1,9 @@
 """Shape Stacking against slow obvious versions, the published numbers, and its own promises."""
 
+import errno
 import importlib.util
 import math
+import os
 import resource
 import subprocess
 import sys
@@ -306,6 +308,18 @@ def test_large_requests_are_cached_and_the_cache_is_safe(tmp_path, monkeypatch):
             args = {"action_ids": [1, 2], "num_observations": 3, "cache_dir": tmp_path} | other
             action_observations(**args)
     assert len(list(tmp_path.iterdir())) == 1  # nothing half-written stays
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="no way to ask this system for room")
+def test_full_disk_is_an_error_and_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(stacking_env, "CACHE_FROM", 6)
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="No space left"):
+        action_observations([1, 2], 3, cache_dir=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
