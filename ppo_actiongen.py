@@ -174,7 +174,8 @@ class Args:
     clip_vloss: bool = True
     """Clip the value loss as PPO's original code does, on the raw value scale."""
     encoder_rate: float = 1.0
-    """Factor on the learning rate of the state encoder (ours; the paper: 1)."""
+    """Factor on the learning rate of the state encoder (vector states: and of the critic's hidden
+    layers; ours; the paper: 1)."""
     weight_decay: float = 0.0
     """Decoupled weight decay on the utility's weights and biases (ours; 0 = the paper's)."""
     conv_gain: float | None = None
@@ -1370,10 +1371,11 @@ def modality_is_default(args: Args) -> bool:
 
 
 def variants(args: Args) -> list[str]:
-    """The published variants of the task or of our policy that these options ask for."""
+    """The variants of the task or of our policy that these options ask for."""
     chosen = {
         "ours_full_split": args.split == "full",
-        "ours_conditioned_auxiliary": args.aux_conditioned,
+        "ours_conditioned_auxiliary": args.aux_conditioned and not args.aux_residual,
+        "ours_corrected_auxiliary": args.aux_residual,  # not published
         "ours_no_subgoal_reward": not args.subgoal_reward,
         "ours_no_place": args.placement == "none",
         "ours_2d_place": args.placement == "2d",
@@ -1575,8 +1577,10 @@ def check(args: Args) -> None:
             f"of torchrun's {WORLD_SIZE} processes"
         )
     for name in ("micro_batch", "seed", "split_seed", "hvae_seed"):
-        if getattr(args, name) < 0:
-            raise ValueError(f"{name} {getattr(args, name)} is not allowed; at least 0")
+        if not 0 <= getattr(args, name) < 2**63:
+            raise ValueError(f"{name} {getattr(args, name)} is not allowed; at least 0, below 2^63")
+    if args.threads > 4096:  # ours: far above any machine's
+        raise ValueError(f"threads {args.threads} is not allowed; at most 4096")
     for name, value in vars(args).items():
         values = value if isinstance(value, tuple) else (value,)
         if any(isinstance(v, float) and not math.isfinite(v) for v in values):
@@ -1590,7 +1594,7 @@ def check(args: Args) -> None:
     for name in ("gamma", "gae_lambda", "lr_floor", "ent_floor"):
         if not 0 <= getattr(args, name) <= 1:
             raise ValueError(f"{name} {getattr(args, name)} is not in 0..1")
-    for name in ("clip_coef", "max_grad_norm", "encoder_rate"):
+    for name in ("clip_coef", "max_grad_norm", "encoder_rate", "adam_eps"):
         if getattr(args, name) <= 0:
             raise ValueError(f"{name} {getattr(args, name)} is not above 0")
     for name in ("vf_coef", "weight_decay", "aux_ent_scale", "table_noise"):
@@ -1683,7 +1687,8 @@ class Run:
             ("cuda" if has_cuda else "cpu") if args.device == "auto" else args.device
         )
         if WORLD_SIZE > 1 and self.device.type == "cuda":  # one GPU for each process
-            if (count := torch.cuda.device_count()) <= int(os.environ["LOCAL_RANK"]):
+            wanted = int(os.environ.get("LOCAL_WORLD_SIZE", WORLD_SIZE))
+            if (count := torch.cuda.device_count()) < wanted:  # on all ranks: rank 0 says it
                 raise ValueError(f"torchrun has more processes than GPUs ({count}); --device cpu")
             self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
             torch.cuda.set_device(self.device)
@@ -1908,7 +1913,9 @@ def train(args: Args) -> dict:
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * fraction)
         losses = update(run.agent, run.optimizer, batch, ent_coef, args, run.generator, run.device)
         run.agent.blur(0, None)  # tests and checkpoints know the table as it is
-        if not all(map(math.isfinite, losses.values())):
+        # The losses are those before each step; what the last step made shows in the weights.
+        finite = all(p.isfinite().all() for p in run.agent.parameters())
+        if not (finite and all(map(math.isfinite, losses.values()))):
             raise ValueError(
                 f"after {run.update_index * run.batch_size} steps the loss is no number any more; "
                 f"learning_rate {args.learning_rate} is too high for these settings"
@@ -2000,7 +2007,8 @@ def finish(run: Run) -> dict:
         folder / "metrics.csv", folder / "curve.png", run.module.METRIC, results["published"],
         seen if args.adapt else unseen,
     )  # fmt: skip
-    record_episode(run.agent, run.preprocess, args, run.pools["test"], folder / "episode.gif")
+    pool = run.pool if args.adapt else run.pools["test"]
+    record_episode(run.agent, run.preprocess, args, pool, folder / "episode.gif")
     print_table(results, run.module.METRIC)
     print(f"curve, episode, metrics and checkpoints: {folder}/")
     return results
@@ -2111,8 +2119,8 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     args = Args(**saved)
     if args.env not in MODULES:
         raise ValueError(f"{options.run}: its environment {args.env!r} is not one of {[*MODULES]}")
-    if options.seed < 0:
-        raise ValueError(f"seed {options.seed} is not allowed; at least 0")
+    if not 0 <= options.seed < 2**63:
+        raise ValueError(f"seed {options.seed} is not allowed; at least 0, below 2^63")
     pools, pool, on_offer = action_pools(args)
     whole = on_offer == len(pool)  # trained, and scored, with one whole set on offer
     if options.actions != ("test" if args.adapt else "train"):
@@ -2163,7 +2171,7 @@ def default_args(env: str, recipe: str, quick: bool) -> Args:
     if recipe == "fast":
         args = replace(args, **FAST.get(env, {}))
     if quick:
-        args = replace(args, **QUICK[env])
+        args = replace(args, **QUICK.get(env, {}))
     if quick and recipe == "paper":  # evaluates too seldom for a short run to choose a checkpoint
         args = replace(args, eval_every=min(args.eval_every, args.total_timesteps // 4))
     return args

@@ -3,9 +3,7 @@
 import csv
 import json
 import math
-import os
 import pickle
-import signal
 import subprocess
 import sys
 import time
@@ -582,6 +580,7 @@ def test_number_of_parameters_of_the_grid_world_policy():
 TINY = [
     *["--representation", "engineered", "--minibatch-size", "64", "--eval-every", "768"],
     *["--valid-episodes", "32", "--eval-episodes", "64", "--threads", "1", "--no-tensorboard"],
+    *["--device", "cpu"],  # bit for bit: a GPU adds up in no fixed order
 ]
 
 
@@ -606,18 +605,42 @@ def same_weights(a, b):
     return all(torch.equal(a[k], b[k]) for k in a)
 
 
+def kill_when(process, metrics, rows):
+    """Wait for so many updates, then pull the plug."""
+    deadline = time.time() + 120
+    while time.time() < deadline and process.poll() is None:
+        if metrics.exists() and len(metrics.read_text().splitlines()) > rows + 1:
+            break
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 @pytest.mark.parametrize("words", [[], ["--recipe", "paper"], ["--method", "continuous"]])
 def test_a_run_on_a_gpu_goes_on_and_is_tested(tmp_path, words):
     words = ["--device", "cuda", "--run-name", "one", *words]
-    assert run(command(tmp_path, *words)).returncode == 0
-    (tmp_path / "one" / "results.json").unlink()
+    process = subprocess.Popen(command(tmp_path, *words), cwd=ROOT, stdout=subprocess.DEVNULL)
+    kill_when(process, tmp_path / "one" / "metrics.csv", 4)
+    assert not (tmp_path / "one" / "results.json").exists()
     again = run(command(tmp_path, *words, "--resume"))
     assert again.returncode == 0, again.stderr
     test = [sys.executable, str(ROOT / "ppo_actiongen.py"), "evaluate", str(tmp_path / "one")]
     assert run([*test, "--episodes", "32"]).returncode == 0  # on the CPU
     elsewhere = run(command(tmp_path, *words, "--resume", "--device", "cpu"))
     assert "another kind of device" in elsewhere.stderr
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
+@pytest.mark.parametrize("words", ["create --shrink 2", "create --recipe paper", "stacking"])
+def test_pictures_and_positions_on_a_gpu(tmp_path, words):
+    words = [*words.split(), "--device", "cuda", "--representation", "engineered"]
+    words += "--num-envs 2 --minibatch-size 8 --total-timesteps 64 --eval-every 32".split()
+    words += "--valid-episodes 2 --eval-episodes 2 --aux-conditioned --no-tensorboard".split()
+    words += ["--runs-dir", str(tmp_path), "--run-name", "one"]
+    result = run([sys.executable, str(ROOT / "ppo_actiongen.py"), *words])
+    assert result.returncode == 0, result.stderr
+    assert json.loads((tmp_path / "one" / "results.json").read_text())["steps"] == 64
 
 
 @pytest.fixture(scope="module")
@@ -668,14 +691,7 @@ def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path, mo
     folder, _ = finished
     killed = tmp_path / folder.name
     process = subprocess.Popen(command(tmp_path), cwd=ROOT, stdout=subprocess.DEVNULL)
-    deadline = time.time() + 120
-    while time.time() < deadline:  # wait for a share of the updates, then pull the plug
-        metrics = killed / "metrics.csv"
-        if metrics.exists() and len(metrics.read_text().splitlines()) > 1 + moment * 12:
-            break
-        time.sleep(0.002)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    kill_when(process, killed / "metrics.csv", moment * 12)
     result = run(command(tmp_path, "--resume"))
     assert result.returncode == 0, result.stderr
     assert timeless(folder) == timeless(killed) and same_weights(folder, killed)
@@ -775,6 +791,7 @@ def test_evaluate_a_saved_run(finished, monkeypatch, capsys):
         (["--num-available", "257"], "257"),
         (["--num-available", "0"], "num_available 0 is not in 1..256"),
         (["--seed", "-1"], "seed -1"),
+        (["--seed", str(2**64)], f"seed {2**64} is not allowed"),
         (["--actions", "train", "--unseen-ratio", "0.5"], "choose among unseen actions"),
         (["--actions", "train", "--min-embedding-distance", "1"], "choose among unseen actions"),
     ):
@@ -843,6 +860,9 @@ def test_baselines_and_ablations_run(tmp_path, extra, monkeypatch, capsys):
         (["--max-grad-norm", "0"], "max_grad_norm 0.0 is not above 0"),
         (["--weight-decay", "-1"], "weight_decay -1.0 is not at least 0"),
         (["--encoder-rate", "0"], "encoder_rate 0.0 is not above 0"),
+        (["--adam-eps", "0"], "adam_eps 0.0 is not above 0"),
+        (["--seed", str(2**64)], f"seed {2**64} is not allowed"),
+        (["--threads", "100000"], "threads 100000 is not allowed"),
         (["--modality", "smell"], "modality 'smell' is not one of gridworld's: xy, onehot"),
         (["--eval-available", "300"], "eval_available 300 is not in 1..256"),
         (["--recipe", "paper", "--recipe", "fast"], "may be given only once"),
@@ -995,7 +1015,7 @@ def test_a_table_of_another_recipe_is_refused(tmp_path, monkeypatch):
 
 
 def test_names_tell_runs_apart():
-    """Two runs that differ in what they are do not share a name, and so a folder."""
+    """The paper's methods and what we add to them have names, and so folders, of their own."""
 
     def name(env, **changes):
         return ppo.method_name(replace(ppo.default_args(env, "fast", False), **changes))
@@ -1008,6 +1028,11 @@ def test_names_tell_runs_apart():
     assert name("recsys", method="nearest-neighbor") == "nearest_neighbor"
     assert name("gridworld", representation="a/mine.npz") == "ours_mine"
     assert name("gridworld", representation="vae", utility="bilinear").startswith("non_hier")
+    assert name("create", aux_conditioned=True) == "ours_conditioned_auxiliary"
+    corrected = dict(aux_conditioned=True, aux_residual=True)
+    assert name("create", **corrected) == "ours_corrected_auxiliary"
+    args = replace(ppo.default_args("create", "fast", False), **corrected)
+    assert ppo.published_scores(args) == {}
     assert name("create", modality="video") == "ours_video"
     assert name("create", modality="xy") == name("create") == "ours"
 
@@ -1137,6 +1162,7 @@ def small(tmp_path, *extra):
     """A short Grid World run through main(); returns its folder's parent."""
     words = "--representation engineered --threads 1 --minibatch-size 64 --eval-every 256"
     words += " --valid-episodes 4 --eval-episodes 8 --no-tensorboard --total-timesteps 1024"
+    words += " --device cpu"  # bit for bit: a GPU adds up in no fixed order
     return ["ppo", "gridworld", *words.split(), "--runs-dir", str(tmp_path), *extra]
 
 
@@ -1259,6 +1285,25 @@ def test_finetuning_refuses_another_policy_table_split_or_state(tmp_path, monkey
         with pytest.raises(SystemExit, match=f"cannot fine-tune .*: {words}"):
             ppo.main()
     assert [p.name for p in tmp_path.iterdir()] == ["gridworld-engineered-s0"]
+
+
+def test_a_run_that_diverges_in_the_last_step_of_an_update_says_so(tmp_path, monkeypatch):
+    update = ppo.update
+
+    def ruined(agent, *args):
+        losses = update(agent, *args)
+        agent.critic.bias.data.fill_(float("nan"))
+        return losses
+
+    monkeypatch.setattr(ppo, "update", ruined)
+    monkeypatch.setattr(sys, "argv", small(tmp_path))
+    with pytest.raises(SystemExit, match="learning_rate .* is too high"):
+        ppo.main()
+
+
+def test_quick_is_nothing_special_for_an_environment_of_ones_own(monkeypatch):
+    monkeypatch.setitem(ppo.PRESETS, "dial", ppo.Args(env="dial"))
+    assert ppo.default_args("dial", "fast", True).quick
 
 
 def test_a_run_that_diverges_says_so(tmp_path, monkeypatch):
