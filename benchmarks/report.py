@@ -70,6 +70,7 @@ METHODS = {
     "ours_one_split": "Fast recipe, one split",
     "ours_analysis_fast": "Fast recipe, 762 tools",
     "ours_gains": "Ours, larger gains",
+    "ours_steady_20": "Steadied, 20 on offer",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {
