@@ -1,11 +1,12 @@
 """Tables and figures from results/*.csv; nothing is computed that is not in those files.
 
-    python benchmarks/report.py            # results/*.png and the tables in README.md
-    python benchmarks/report.py --check    # exit 1 if README.md disagrees with the CSV files
+    python benchmarks/report.py            # results/*.png and the tables in both README.md
+    python benchmarks/report.py --check    # exit 1 if a README.md disagrees with the CSV files
     python benchmarks/report.py results-paper   # only the pictures, of and in another folder
 
 One picture results/<experiment>.png per figure or analysis of benchmarks/paper.py, and one table
-between the markers of that name in README.md. What has no results yet is left out.
+between the markers of that name in README.md (main results, recipes) or results/README.md
+(everything else). What has no results yet is left out.
 Bars: our mean over seeds, filled; published mean, outlined; dots: our seeds; line: the ceiling.
 """
 
@@ -97,7 +98,7 @@ RECIPE = {
         "fast": ("none: the fast recipe", ""),
         "no_exploring": (
             "no random choices while learning",
-            "one in ten: what nobody tries any more is forgotten (pays later: 4M steps above)",
+            "one in ten: what nobody tries any more is forgotten (pays after 4M steps: all results)",
         ),
         "no_outcome": (
             "and the paper's loss alone",
@@ -155,7 +156,8 @@ RECIPE_NOTE = {
     "above it have undone. Every later row undoes one thing more, starting from row 4 (networks "
     "half as wide): compare it with that one",
     "create-recipe": "Learned representation; what the second row undoes pays later (2M steps, "
-    "see *What we learned in CREATE*), and each row below it keeps what it has undone",
+    "see *What we learned in CREATE* among all results), and each row below it keeps what it has "
+    "undone",
 }
 
 
@@ -442,7 +444,7 @@ def overview(experiment: str) -> str:
                 text = with_budget(text, ours[env], method, usual[env])
             cells.append(text)
         lines.append("| " + " | ".join(cells) + " |")
-    note = note_on_brackets(lines, "published (more steps, see the first table of Results)")
+    note = note_on_brackets(lines, "published (more steps: results/README.md)")
     return "\n".join(lines) + (
         f"\n\nUnseen actions{note} Without ±: one seed. Other numbers of steps stand by the score."
     )
@@ -808,7 +810,7 @@ def tsne_figure(experiment: str, path: Path) -> None:
     save(figure, path)
 
 
-# ---- README.md ----
+# ---- README.md and results/README.md ----
 
 
 def has_results(experiment: str) -> bool:
@@ -850,7 +852,7 @@ def draw(experiment: str) -> list[Path]:
 
 
 def section(experiment: str) -> str:
-    """What stands between an experiment's markers in README.md; "" without results."""
+    """What stands between an experiment's markers, as in README.md; "" without results."""
     if not has_results(experiment):
         return ""
     if experiment in paper.RECIPES:
@@ -881,16 +883,20 @@ def section(experiment: str) -> str:
     return "\n\n".join(filter(None, parts))
 
 
-def fill(text: str, experiment: str) -> str:
-    """README text with an experiment's table between its two markers."""
+def fill(text: str, experiment: str, readme: Path) -> str:
+    """Text of a README with an experiment's table between its two markers, if it has them."""
     start, end = f"<!-- results:{experiment} -->", f"<!-- end:{experiment} -->"
-    before, rest = text.split(start)
+    if start not in text:
+        return text
     content = section(experiment)
+    if readme.parent != ROOT:  # results/README.md: the pictures are beside it, headings go first
+        content = content.replace("](results/", "](").replace("### ", "## ", 1)
+    before, rest = text.split(start)
     return f"{before}{start}\n{content}{chr(10) if content else ''}{end}{rest.split(end)[1]}"
 
 
 def main() -> None:
-    """Draw everything there are results for, and write (or check) the README's tables."""
+    """Draw everything there are results for, and write (or check) the tables of both READMEs."""
     global RESULTS
     for flag in (a for a in sys.argv[1:] if a.startswith("-") and a != "--check"):
         raise SystemExit(__doc__ if flag in ("-h", "--help") else f"error: unknown option {flag}")
@@ -901,20 +907,21 @@ def main() -> None:
         for experiment in paper.EXPERIMENTS:
             draw(experiment)
         return
-    readme = ROOT / "README.md"
-    text = new = readme.read_text()
+    check = "--check" in sys.argv
     for experiment in paper.EXPERIMENTS:
-        if f"<!-- results:{experiment} -->" in text:
-            new = fill(new, experiment)
-        if "--check" not in sys.argv:
+        if not check:
             draw(experiment)
-    if "--check" in sys.argv:
-        if new != text:
+    for readme in (ROOT / "README.md", ROOT / "results/README.md"):
+        text = new = readme.read_text()
+        for experiment in paper.EXPERIMENTS:
+            new = fill(new, experiment, readme)
+        if check and new != text:
+            name = readme.relative_to(ROOT)
             raise SystemExit(
-                "error: README.md disagrees with results/*.csv; run benchmarks/report.py"
+                f"error: {name} disagrees with results/*.csv; run benchmarks/report.py"
             )
-        return
-    readme.write_text(new)
+        if not check:
+            readme.write_text(new)
 
 
 if __name__ == "__main__":

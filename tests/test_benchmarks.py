@@ -257,13 +257,14 @@ def test_a_finished_adaptation_has_one_phase_and_a_curve(tmp_path):
 
 
 def test_pictures_of_another_folder_leave_the_readme_alone(tmp_path, monkeypatch):
-    text = (ROOT / "README.md").read_text()
+    readme = ROOT / "results/README.md"
+    text = readme.read_text()
     same = dict(env="gridworld", method="ours", seed=0, steps=9, hours=1, score=0.5)
     write(tmp_path / "gridworld.csv", [same | {"phase": p} for p in ("train", "valid", "test")])
     monkeypatch.setattr(sys, "argv", ["report.py", str(tmp_path)])
     monkeypatch.setattr(report, "RESULTS", report.RESULTS)  # main changes it
     report.main()
-    assert (tmp_path / "gridworld.png").exists() and text == (ROOT / "README.md").read_text()
+    assert (tmp_path / "gridworld.png").exists() and text == readme.read_text()
     monkeypatch.setattr(sys, "argv", ["report.py", str(tmp_path / "nowhere")])
     with pytest.raises(SystemExit, match="nowhere"):
         report.main()

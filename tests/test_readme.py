@@ -1,4 +1,4 @@
-"""The README against the repository: names exist, commands are accepted, tables equal the CSV."""
+"""Both READMEs against the repository: names exist, commands are accepted, tables equal the CSV."""
 
 import importlib
 import json
@@ -9,7 +9,14 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-TEXT = (ROOT / "README.md").read_text()
+PAGES = {path: path.read_text() for path in (ROOT / "README.md", ROOT / "results/README.md")}
+TEXT = "\n".join(PAGES.values())
+
+
+def anchors(text: str) -> set[str]:
+    """The names by which a page's headings can be linked to, made as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.S), re.M)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
 
 def test_every_name_of_the_paper_map_exists():
@@ -24,11 +31,14 @@ def test_every_name_of_the_paper_map_exists():
             assert hasattr(module, name), f"{file} has no {name}"
 
 
-def test_every_script_and_picture_it_names_exists():
+def test_every_script_picture_and_heading_they_link_to_exists():
     for path in set(re.findall(r"python (?:-m )?([\w/]+\.py)", TEXT)) - {"dial.py"}:
         assert (ROOT / path).exists(), path
-    for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", TEXT):
-        assert (ROOT / path).exists(), path
+    for page, text in PAGES.items():
+        for path, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
+            target = (page.parent / path).resolve() if path else page
+            assert target.exists(), f"{page}: {path}"
+            assert not anchor or anchor in anchors(PAGES[target]), f"{page}: #{anchor}"
 
 
 def test_tables_equal_the_csv_files():
