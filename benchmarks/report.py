@@ -98,7 +98,7 @@ RECIPE = {
         "fast": ("none: the fast recipe", ""),
         "no_exploring": (
             "no random choices while learning",
-            "one in ten: what nobody tries any more is forgotten (pays after 4M steps: all results)",
+            "one in ten: what nobody tries any more is forgotten (pays later: after 4M steps)",
         ),
         "no_outcome": (
             "and the paper's loss alone",
