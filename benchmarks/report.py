@@ -72,6 +72,7 @@ METHODS = {
     "ours_analysis_fast": "Fast recipe, 762 tools",
     "ours_gains": "Ours, larger gains",
     "ours_steady_20": "Steadied, 20 on offer",
+    "ours_steady_entropy": "Steadied, entropy",
 }
 # What "ours" is called where it stands beside its own variants.
 MAIN_LABELS = {

@@ -75,6 +75,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_one_split",
             "ours_steady",
             "ours_steady_20",
+            "ours_steady_entropy",
             "ours_analysis",
             "ours_analysis_fast",
             "ours_gains",
