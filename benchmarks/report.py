@@ -487,11 +487,14 @@ def panel_figure(experiment: str, path: Path) -> None:
     save(figure, path)
 
 
-def save(figure, path: Path, colors: int = 32) -> None:
+def save(figure, path: Path, colors: int = 48) -> None:
     """Write a picture in few colours, a third of the bytes, and forget the figure."""
     with BytesIO() as file:
         figure.savefig(file, dpi=110)
-        Image.open(file).convert("RGB").quantize(colors).save(path, optimize=True)
+        picture = Image.open(file).convert("RGB")
+        # The usual median cut gives small areas, such as bars, the colour of their neighbours.
+        palette = dict(method=Image.Quantize.MAXCOVERAGE, kmeans=4)
+        picture.quantize(colors, **palette).save(path, optimize=True)
     plt.close(figure)
 
 
