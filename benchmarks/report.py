@@ -169,7 +169,9 @@ def read(path: Path) -> list[dict]:
 
 def published(env: str) -> dict[tuple[str, str], tuple[float, float, int]]:
     """(method, phase) -> published mean, std, number of seeds; env as in paper.RUNS."""
-    name, _, task = env.partition("-") if env.startswith("create-") else (env, "", "")
+    name, task = env, ""
+    if env.startswith("create-"):  # create-push-steady: push in another recipe
+        name, task = env.split("-")[:2]
     rows = [
         r
         for r in read(PUBLISHED / "published_results.csv")
