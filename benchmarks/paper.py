@@ -352,7 +352,8 @@ EXPERIMENTS |= {
     ),
     "analysis-set-size": Experiment(
         "Analysis: number of tools on offer",
-        main_tasks("ours", "ours_no_entropy", "ours_no_subsampling", "ours_fast"),
+        main_tasks("ours", "ours_no_entropy", "ours_no_subsampling", "ours_fast")
+        | {"create-push-steady": ("ours", "ours_no_entropy", "ours_no_subsampling")},
         tests=tuple(  # 1,000 episodes: published code
             f"--actions test --episodes 1000 --num-available {K}" for K in range(10, 61, 5)
         ),

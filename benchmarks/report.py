@@ -167,11 +167,14 @@ def read(path: Path) -> list[dict]:
     return list(csv.DictReader(path.open())) if path.exists() else []
 
 
+def task_of(env: str) -> str | None:
+    """CREATE's task; create-push-steady is push in another recipe."""
+    return env.split("-")[1] if env.startswith("create-") else None
+
+
 def published(env: str) -> dict[tuple[str, str], tuple[float, float, int]]:
     """(method, phase) -> published mean, std, number of seeds; env as in paper.RUNS."""
-    name, task = env, ""
-    if env.startswith("create-"):  # create-push-steady: push in another recipe
-        name, task = env.split("-")[:2]
+    name, task = (env, "") if task_of(env) is None else ("create", task_of(env))
     rows = [
         r
         for r in read(PUBLISHED / "published_results.csv")
@@ -664,7 +667,7 @@ def note_on_brackets(lines: list[str], what: str) -> str:
 
 def published_analysis(experiment: str, env: str, method: str) -> dict[float, tuple[float, float]]:
     """x -> published mean and std."""
-    name, task = ANALYSES[experiment][2], env.removeprefix("create-")
+    name, task = ANALYSES[experiment][2], task_of(env) or env
     method = method.replace("ours_analysis", "ours")
     rows = read(PUBLISHED / "published_analyses.csv")
     rows = [r for r in rows if (r["analysis"], r["task"], r["method"]) == (name, task, method)]
@@ -704,13 +707,14 @@ def analysis_table(experiment: str) -> str:
 def analysis_figure(experiment: str, path: Path) -> None:
     """One panel per environment; ours in colour, published in grey."""
     found, (_, title, name) = analysed(experiment), ANALYSES[experiment]
-    envs = list(dict.fromkeys(env for env, _ in found))
+    envs, methods = (list(dict.fromkeys(names)) for names in zip(*found, strict=True))
     figure, axes = plt.subplots(1, len(envs), figsize=(3.4 * len(envs) + 3, 3.4), squeeze=False)
+    legend = {}  # label -> handle, of all panels
     for axis, env in zip(axes.flat, envs, strict=True):
         # The published distances belong to another table of representations: an axis of their own.
         theirs = axis.twiny() if name == "emb" else axis
-        for i, method in enumerate(m for e, m in found if e == env):
-            points = found[env, method]
+        for method in (m for e, m in found if e == env):
+            points, i = found[env, method], methods.index(method)
             means = [mean(float(r["score"]) for r in rows) for rows in points.values()]
             # Standard error over the episodes of a test, and seeds as dots.
             errors = [mean(float(r["stderr"]) for r in rows) for rows in points.values()]
@@ -731,15 +735,13 @@ def analysis_figure(experiment: str, path: Path) -> None:
         axis.set_title(paper.TITLES[env], fontsize=9)
         axis.set_ylabel(quantity(env), fontsize=8)
         axis.set_ylim(0, None)
-        handles = axis.get_legend_handles_labels()
         if theirs is not axis:
             theirs.set_xlabel("published: squared distance of their representations", fontsize=8)
-            handles = [
-                a + b for a, b in zip(handles, theirs.get_legend_handles_labels(), strict=True)
-            ]
-        if axis is axes[0, -1]:  # beside the panels: inside, there are curves everywhere
-            place = dict(loc="center left", bbox_to_anchor=(1, 0.5))
-            axis.legend(*handles, frameon=False, fontsize=7, **place)
+        for handles, labels in {a: a.get_legend_handles_labels() for a in (axis, theirs)}.values():
+            legend |= dict(zip(labels, handles, strict=True))
+    # Beside the panels: inside, there are curves everywhere.
+    place = dict(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, fontsize=7)
+    axes[0, -1].legend(legend.values(), legend.keys(), **place)
     figure.tight_layout()
     save(figure, path)
 
