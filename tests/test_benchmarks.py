@@ -332,6 +332,7 @@ def test_published_scores_are_found():
         method = "ours" if name == "set-size" else "ours_analysis"
         known = report.published_analysis(f"analysis-{name}", "create-push", method)
         assert len(known) == x
+        assert known == report.published_analysis(f"analysis-{name}", "create-push-steady", method)
 
 
 def write(path, rows):
