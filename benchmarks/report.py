@@ -276,7 +276,7 @@ def longest(env: str) -> dict[tuple[str, str], list[dict]]:
 
 def table(env: str) -> str:
     """A Markdown table: per method ours (mean and std over seeds) beside the published numbers."""
-    ours, theirs = scores(env), published(env)
+    ours, theirs = scores(env, shown(env)[env]), published(env)
     ceiling = ppo_actiongen.CEILINGS.get(env)
     phases = "" if not ceiling or ceiling[0] == ceiling[1] else " (seen: {0})"
     lines = [
@@ -335,8 +335,8 @@ def recipe_table(env: str) -> str:
 
 def bar_figure(env: str, path: Path) -> None:
     """Train and test bars per method, ours filled and published outlined."""
-    ours, long, theirs = scores(env), longest(env), published(env)
     methods = shown(env)[env]
+    ours, long, theirs = scores(env, methods), longest(env), published(env)
     usual = usual_budget(ours, methods)
     # What has no published bar to stand beside is shown at its best: its longest runs.
     for key in [(m, p) for m in methods for p in ("train", "test") if (m, p) not in theirs]:
