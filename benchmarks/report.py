@@ -534,7 +534,7 @@ def all_curves(experiment: str, path: Path) -> None:
                 axis.text(0.5, 0.5, "-", transform=axis.transAxes, ha="center", color="0.6")
                 axis.spines[:].set_visible(False)
                 axis.tick_params(left=False, labelleft=False, bottom=axis is column[-1])
-        column[0].set_title(paper.TITLES[env].replace(", partially", "\npartially"), fontsize=8)
+        column[0].set_title(paper.TITLES[env].replace(", ", "\n"), fontsize=8)
         column[-1].set_xlabel("million steps", fontsize=8)
     for line, method in zip(axes, methods, strict=True):
         line[0].set_ylabel(METHODS[method].replace(" ", "\n", 1), fontsize=8)
