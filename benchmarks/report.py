@@ -625,6 +625,9 @@ def adaptation_figure(experiment: str, path: Path) -> None:
                 axis.plot(steps, values, f"C{i}", lw=1, marker=".", ms=2, label=METHODS[method])
         if line is not None:
             axis.axhline(line, color="k", ls="--", lw=1, label="Ours, zero-shot")
+        bottom, top = axis.get_ylim()
+        if bottom < 0:  # no score is
+            axis.set_ylim(0, max(top, 0.05))
         axis.set_title(paper.TITLES[env], fontsize=9)
         axis.set_xlabel("million steps", fontsize=8)
         axis.set_ylabel(quantity(env), fontsize=8)
