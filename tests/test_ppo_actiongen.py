@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 import pickle
 import subprocess
 import sys
@@ -684,6 +685,17 @@ def test_one_seed_gives_one_run_with_two_threads(tmp_path):
         words = command(folder.parent, "--threads", "2", "--minibatch-size", "1024", steps=4096)
         assert run(words).returncode == 0
     assert timeless(folders[0]) == timeless(folders[1]) and same_weights(*folders)
+
+
+def test_matrix_products_add_up_in_a_fixed_order():
+    # Whether MKL would otherwise show different bits depends on the processor and the moment, so
+    # this asks for its mode, which it prints with every product.
+    program = "import torch, ppo_actiongen; torch.ones(64, 64) @ torch.ones(64, 64)"
+    result = run([sys.executable, "-c", program], env=os.environ | {"MKL_VERBOSE": "1"})
+    assert result.returncode == 0, result.stderr
+    if "SGEMM" not in result.stdout:
+        pytest.skip("PyTorch multiplies with another library here")
+    assert "CNR:AUTO" in result.stdout and "CNR:OFF" not in result.stdout
 
 
 @pytest.mark.parametrize("moment", [0.3, 0.8])
