@@ -73,7 +73,11 @@ NARROW = f"gridworld --hidden-size 64 --utility-hidden 128 {PLAIN}"
 LSTM = f"{NARROW} --hvae-recipe lstm"
 # CREATE's methods are compared with pictures as the paper's policy sees them, and what goes with
 # them. The fast recipe's, twice as fast, are a row of their own.
-AS_IS = "--shrink 1 --no-white-is-zero --no-norm-features --learning-rate 0.001 --micro-batch 128"
+# NARROW_CREATE is the fast recipe with Table 4's width and D.3.2's position head, in small steps.
+SMALL = "--hidden-size 64 --minibatch-size 256 --no-aux-conditioned --no-aux-residual"
+NARROW_CREATE = f"{SMALL} --learning-rate 0.0003"
+AS_IS = f"{SMALL} --shrink 1 --no-white-is-zero --no-norm-features --learning-rate 0.001"
+AS_IS += " --micro-batch 128"
 PICTURES = f"{AS_IS} --clip-coef 0.1"
 MAIN_TASKS = "push obstacle seesaw".split()  # CREATE in the main paper
 MORE_TASKS = "navigate cannon ladder belt buckets basket collide moving funnel".split()  # Figure 8
@@ -129,7 +133,7 @@ RUNS: dict[str, dict[str, str]] = {
         "gains_0.01": f"{NARROW} --representation engineered --utility-gains 0.01 0.01 0.01",
     },
     "create-recipe": {
-        "fast": "create",
+        "narrow": f"create {NARROW_CREATE}",
         "pictures_as_is": f"create {PICTURES}",
         "conv_default": f"create {PICTURES} --conv-gain None",
         "value_coefficient_0.5": f"create {PICTURES} --vf-coef 0.5",
@@ -160,7 +164,8 @@ RUNS["recsys-full"] = {
 RUNS["recsys"] |= commands("recsys --utility mlp", ADAPT, end="--budget 0.1")
 # The fast recipe in a hurry: heads at Table 4's rate, a wide clip, less and less entropy. Figure
 # 8's nine tasks have it, since they get few steps here: pictures as they are take twice as long.
-EARLY = "--learning-rate 0.001 --encoder-rate 0.3 --clip-coef 0.3 --standardize --ent-floor 0.1"
+EARLY = f"{SMALL} --learning-rate 0.001 --encoder-rate 0.3 --clip-coef 0.3 --standardize"
+EARLY += " --ent-floor 0.1"
 for task in MORE_TASKS:
     RUNS[f"create-{task}"] = commands(f"create --task {task} {EARLY}", BASELINES)
 for task in MAIN_TASKS:
@@ -169,7 +174,11 @@ for task in MAIN_TASKS:
     RUNS[f"create-{task}"] |= commands(start, ORACLE, VARIANTS)
     # published code: 5e6 to 2e7 of 6e7 steps
     RUNS[f"create-{task}"] |= commands(start, ADAPT, end="--budget 0.25")
-    RUNS[f"create-{task}"]["ours_fast"] = f"create --task {task}"  # beyond the paper
+    # Beyond the paper: the fast recipe, and what its networks and its position head are worth.
+    RUNS[f"create-{task}"]["ours_fast"] = f"create --task {task}"
+    RUNS[f"create-{task}"]["ours_fast_64"] = f"create --task {task} --hidden-size 64"
+    RUNS[f"create-{task}"]["ours_fast_plain"] = f"create --task {task} --no-aux-conditioned"
+    RUNS[f"create-{task}"]["ours_narrow"] = f"create --task {task} {NARROW_CREATE}"
 # Published for seesaw only.
 RUNS["create-seesaw"] |= commands(f"create --task seesaw {PICTURES}", ENGINEERED)
 # Beyond the paper: the loss of Grid World's fast recipe, scaled down because a goal is worth 10.
@@ -181,10 +190,11 @@ STEADY = "--aux-conditioned --aux-residual --table-noise 0.5"
 MORE_ENTROPY = "--ent-coef 0.02 --ent-floor 0.05"
 for task in MAIN_TASKS:
     RUNS[f"create-{task}"]["ours_early"] = f"create --task {task} {EARLY}"
-    # C.4 with the fast recipe: a tool's place can be learned before the choice has narrowed.
-    RUNS[f"create-{task}"]["ours_placed"] = f"create --task {task} --aux-conditioned"
+    narrow = f"create --task {task} {NARROW_CREATE}"
+    # C.4: a tool's place can be learned before the choice has narrowed.
+    RUNS[f"create-{task}"]["ours_placed"] = f"{narrow} --aux-conditioned"
     # Beyond C.4: the tool corrects its place, and the policy never sees the same table twice.
-    steady = f"create --task {task} {STEADY}"
+    steady = f"{narrow} {STEADY}"
     RUNS[f"create-{task}"]["ours_steady"] = steady
     # ... with fewer tools on offer while learning, as Grid World's fast recipe.
     RUNS[f"create-{task}"]["ours_steady_20"] = f"{steady} --num-available 20 --eval-available 50"
@@ -193,16 +203,17 @@ for task in MAIN_TASKS:
     if task != "push":
         RUNS[f"create-{task}"]["ours_steady_entropy"] = f"{steady} {MORE_ENTROPY}"
     # As published, and as anyone runs it who only says --seed: other seeds of training, one split.
-    RUNS[f"create-{task}"]["ours_one_split"] = f"create --task {task} --split-seed 0"
+    RUNS[f"create-{task}"]["ours_one_split"] = f"{narrow} --split-seed 0"
     # The three analyses of a policy that gets further in the same steps.
     analysis = VARIANTS["ours_analysis"]
-    RUNS[f"create-{task}"]["ours_analysis_fast"] = f"create --task {task} {analysis}"
+    RUNS[f"create-{task}"]["ours_analysis_narrow"] = f"{narrow} {analysis}"
 # All methods in the recipe whose seeds agree, where a policy gets far enough to tell them apart.
 # The two baselines without a utility have no correction by the tool, no table to add noise to.
 DISCRETE = {m: BASELINES[m] for m in ("nearest_neighbor", "continuous_output")}
+narrow = f"create --task push {NARROW_CREATE}"
 RUNS["create-push-steady"] = commands(
-    f"create --task push {STEADY} {MORE_ENTROPY}", BASELINES, ORACLE, ENGINEERED
-) | commands(f"create --task push {MORE_ENTROPY}", DISCRETE)
+    f"{narrow} {STEADY} {MORE_ENTROPY}", BASELINES, ORACLE, ENGINEERED
+) | commands(f"{narrow} {MORE_ENTROPY}", DISCRETE)
 
 
 # ---- every figure and analysis: the runs it shows, and what they are tested with ----
@@ -227,15 +238,16 @@ class Experiment:
 # Methods that are not the paper's
 BEYOND = {"ours_mlp_encoder", "ours_wide", "ours_outcome", "ours_bilinear", "ours_gains"}
 BEYOND |= {"ours_paper_recipe"}  # the paper's, but with --recipe paper it is the same as "ours"
+BEYOND |= {"ours_fast_64", "ours_fast_plain", "ours_narrow"}
 BEYOND |= {"ours_fast", "engineered_fast", "ours_early", "ours_predicts", "ours_clip"}
 BEYOND |= {"ours_placed", "ours_steady", "ours_steady_20", "ours_steady_entropy"}
-BEYOND |= {"ours_one_split", "ours_analysis_fast"}
+BEYOND |= {"ours_one_split", "ours_analysis_narrow"}
 
 
 def methods_of(environment: str, *, beyond: bool = True) -> tuple[str, ...]:
     """The methods of an environment's main comparison: all but variants and adaptation."""
     omit = set(ADAPT) | set(VARIANTS) - {"ours_video"} | {"ours_no_place", "ours_2d_place"}
-    omit |= {"ours_analysis_fast"} if beyond else BEYOND
+    omit |= {"ours_analysis_narrow"} if beyond else BEYOND
     return tuple(m for m in RUNS[environment] if m not in omit)
 
 
@@ -250,7 +262,7 @@ MAIN.insert(3, "create-push-steady")  # where the methods get far enough to tell
 TITLES = {
     "gridworld": "Grid World",
     "gridworld-recipe": "Grid World: what each difference of the fast recipe is worth",
-    "create-recipe": "CREATE push: what each difference of the fast recipe is worth",
+    "create-recipe": "CREATE push: what each difference of the narrow recipe is worth",
     "recsys": "Recommender, partially observable",
     "recsys-full": "Recommender, fully observable",
     **{f"create-{task}": f"CREATE {task}" for task in MAIN_TASKS + MORE_TASKS},
@@ -336,24 +348,24 @@ EXPERIMENTS |= {
     ),
     "analysis-angle": Experiment(
         "Analysis: tools at least so many degrees from every training tool of their class",
-        main_tasks("ours_analysis", "ours_analysis_fast"),
+        main_tasks("ours_analysis", "ours_analysis_narrow"),
         tests=tuple(f"{ANALYSIS} --min-angle-gap {gap}" for gap in (15, 12, 9, 6, 3)),
     ),
     # Published: absolute squared distances 0.5 .. 5, which depend on the scale of one encoder's
     # table. Here: quantiles of the unseen tools' squared distance to the nearest training tool.
     "analysis-embedding": Experiment(
         "Analysis: tools whose representation is far from those of all training tools",
-        main_tasks("ours_analysis", "ours_analysis_fast"),
+        main_tasks("ours_analysis", "ours_analysis_narrow"),
         tests=tuple(f"{ANALYSIS} --min-embedding-distance q0.{q}" for q in range(10)),
     ),
     "analysis-unseen-ratio": Experiment(
         "Analysis: share of unseen tools among those on offer",
-        main_tasks("ours_analysis", "ours_analysis_fast"),
+        main_tasks("ours_analysis", "ours_analysis_narrow"),
         tests=tuple(f"{ANALYSIS} --unseen-ratio {r / 5}" for r in range(6)),
     ),
     "analysis-set-size": Experiment(
         "Analysis: number of tools on offer",
-        main_tasks("ours", "ours_no_entropy", "ours_no_subsampling", "ours_fast")
+        main_tasks("ours", "ours_no_entropy", "ours_no_subsampling", "ours_fast", "ours_narrow")
         | {"create-push-steady": ("ours", "ours_no_entropy", "ours_no_subsampling")},
         tests=tuple(  # 1,000 episodes: published code
             f"--actions test --episodes 1000 --num-available {K}" for K in range(10, 61, 5)

@@ -68,6 +68,9 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_predicts",
             "ours_clip",
             "ours_fast",
+            "ours_fast_64",
+            "ours_fast_plain",
+            "ours_narrow",
             "ours_paper_recipe",
             "engineered_fast",
             "ours_early",
@@ -77,7 +80,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_steady_20",
             "ours_steady_entropy",
             "ours_analysis",
-            "ours_analysis_fast",
+            "ours_analysis_narrow",
             "ours_gains",
         ):
             assert ppo_actiongen.method_name(args) == run.method, run.command

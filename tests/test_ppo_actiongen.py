@@ -1040,10 +1040,15 @@ def test_names_tell_runs_apart():
     assert name("recsys", method="nearest-neighbor") == "nearest_neighbor"
     assert name("gridworld", representation="a/mine.npz") == "ours_mine"
     assert name("gridworld", representation="vae", utility="bilinear").startswith("non_hier")
-    assert name("create", aux_conditioned=True) == "ours_conditioned_auxiliary"
+    # C.4 and what we make of it: a variant in Stacking, in CREATE's fast recipe how it is.
     corrected = dict(aux_conditioned=True, aux_residual=True)
-    assert name("create", **corrected) == "ours_corrected_auxiliary"
-    args = replace(ppo.default_args("create", "fast", False), **corrected)
+    for env in ("create", "stacking"):
+        conditioned = dict(aux_conditioned=True, aux_residual=False)
+        assert name(env, **conditioned) == "ours_conditioned_auxiliary"
+        assert name(env, aux_conditioned=False) == "ours"
+    assert name("create", **corrected) == "ours"
+    assert name("stacking", **corrected) == "ours_corrected_auxiliary"
+    args = replace(ppo.default_args("stacking", "fast", False), **corrected)
     assert ppo.published_scores(args) == {}
     assert name("create", modality="video") == "ours_video"
     assert name("create", modality="xy") == name("create") == "ours"
@@ -1146,8 +1151,12 @@ def test_conditioned_position_head_is_the_mlp_of_code_and_chosen_action():
     )
 
 
-def test_conditioned_head_reproduces_the_log_probabilities_of_the_rollout():
-    agent, _ = make_agent(HYBRID, aux_conditioned=True)
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"method": "nearest-neighbor"}, {"method": "continuous"}, {"utility": "bilinear"}],
+)
+def test_conditioned_head_reproduces_the_log_probabilities_of_the_rollout(changes):
+    agent, _ = make_agent(HYBRID, aux_conditioned=True, **changes)
     state, available = torch.randn(9, 7), random_sets(9)
     P, generator = agent.project_actions(), torch.Generator().manual_seed(1)
     action, logprob, _ = agent.act(state, available, P, generator)
@@ -1269,7 +1278,6 @@ def tyro_args(words):
         (["--finetune", "nowhere"], "no checkpoint"),
         (["--adapt", "--method", "continuous"], "continuous"),
         (["--aux-conditioned"], "no position"),
-        (["--aux-residual"], "aux_residual needs aux_conditioned"),
         (["--table-noise", "-1"], "table_noise -1.0 is not at least 0"),
         (["--table-noise", "1", "--method", "continuous"], "table_noise needs method 'utility'"),
     ],
