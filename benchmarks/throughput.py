@@ -295,7 +295,7 @@ def image() -> Iterator[Row]:
     fast, large, plain = rates.values()
     yield "  ratio to the plain form, 84 x 84 pixels", large / plain, "x", "", "same process"
     yield "  ratio to it with half the pixels a side", fast / plain, "x", "", "same process"
-    few, many = 12 * 1024, 36 * 1024  # rollouts of the fast recipe
+    few, many = 12 * 1024, 36 * 1024  # 3 and 9 rollouts of the fast recipe
     (_, start), (wall, end) = _torchrun(few), _torchrun(many)
     both = 2 * (many - few) / (end - start)  # of what is in between, without start and end
     note = "per CPU second of both, times 2: what two free cores give"
