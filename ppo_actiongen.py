@@ -332,13 +332,11 @@ FAST = {
         white_is_zero=True,
         norm_features=True,
         clip_coef=0.2,  # goals are rare: let each one teach more (Table 4: 0.1)
-        # Which tool, and where to put it in this picture, is more than 64 units can hold: they end
-        # with one kind of tool in one place, and which one is luck.
+        # Which tool, and where to put it in this picture: with 64 units and one place for all
+        # tools, some seeds get stuck with what they happened to try first.
         hidden_size=256,
-        # A ramp and a cannon belong in different places, but at first in the same: see
-        # CorrectedHead.
-        aux_conditioned=True,
-        aux_residual=True,
+        aux_conditioned=True,  # a ramp and a cannon belong in different places,
+        aux_residual=True,  # ... but begin in the same one, see CorrectedHead
         micro_batch=256,  # with these pictures that fits
         conv_gain=math.sqrt(2),  # PyTorch's own shrinks what differs between two pictures 100 times
         utility_gains=(1.0, math.sqrt(2), 0.01),
@@ -348,7 +346,7 @@ FAST = {
         minibatch_size=1024,  # rollouts of 128 steps: three times as many updates per step
         clip_vloss=False,  # a goal is worth 10: with steps of 0.1 the critic needs 100 updates
         lr_decay_steps=None,  # over the run
-        total_timesteps=4_000_000,
+        total_timesteps=2_000_000,
         eval_every=205_000,
     ),
     "stacking": dict(
