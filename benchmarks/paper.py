@@ -178,6 +178,8 @@ for task in MAIN_TASKS:
     RUNS[f"create-{task}"]["ours_fast"] = f"create --task {task}"
     RUNS[f"create-{task}"]["ours_fast_64"] = f"create --task {task} --hidden-size 64"
     RUNS[f"create-{task}"]["ours_fast_plain"] = f"create --task {task} --no-aux-conditioned"
+    small_steps = "--minibatch-size 256 --learning-rate 0.0005"  # as --quick
+    RUNS[f"create-{task}"]["ours_fast_small"] = f"create --task {task} {small_steps}"
     RUNS[f"create-{task}"]["ours_narrow"] = f"create --task {task} {NARROW_CREATE}"
 # Published for seesaw only.
 RUNS["create-seesaw"] |= commands(f"create --task seesaw {PICTURES}", ENGINEERED)
@@ -238,7 +240,7 @@ class Experiment:
 # Methods that are not the paper's
 BEYOND = {"ours_mlp_encoder", "ours_wide", "ours_outcome", "ours_bilinear", "ours_gains"}
 BEYOND |= {"ours_paper_recipe"}  # the paper's, but with --recipe paper it is the same as "ours"
-BEYOND |= {"ours_fast_64", "ours_fast_plain", "ours_narrow"}
+BEYOND |= {"ours_fast_64", "ours_fast_plain", "ours_fast_small", "ours_narrow"}
 BEYOND |= {"ours_fast", "engineered_fast", "ours_early", "ours_predicts", "ours_clip"}
 BEYOND |= {"ours_placed", "ours_steady", "ours_steady_20", "ours_steady_entropy"}
 BEYOND |= {"ours_one_split", "ours_analysis_narrow"}

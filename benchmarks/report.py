@@ -51,6 +51,7 @@ METHODS = {
     "ours_fast": "Fast recipe",
     "ours_fast_64": "Fast recipe, width 64",
     "ours_fast_plain": "Fast recipe, D.3.2's place",
+    "ours_fast_small": "Fast recipe, small steps",
     "ours_narrow": "Narrow recipe",
     "engineered_fast": "Fast recipe, engineered",
     "ours_paper_recipe": "Paper's recipe",

@@ -70,6 +70,7 @@ def test_every_training_command_is_understood_and_named_after_its_method():
             "ours_fast",
             "ours_fast_64",
             "ours_fast_plain",
+            "ours_fast_small",
             "ours_narrow",
             "ours_paper_recipe",
             "engineered_fast",
