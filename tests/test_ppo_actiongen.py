@@ -1060,6 +1060,8 @@ def test_quick_paper_recipe_chooses_among_checkpoints():
         updates = args.total_timesteps // (args.minibatch_size * args.num_minibatches)
         between = args.eval_every // (args.minibatch_size * args.num_minibatches)
         assert updates // max(1, between) >= 3, env
+        assert args.minibatch_size == ppo.PRESETS[env].minibatch_size  # still the paper's
+        assert args.learning_rate == ppo.PRESETS[env].learning_rate
 
 
 def test_unknown_environment_and_recipe(monkeypatch):
