@@ -23,19 +23,18 @@ Commands:
 
 Paper map (appendix -> here):
 
-    A.1 State                  LAYOUTS, GridWorldEnv._observe
     A.1 Actions                SKILL_MOVES, walk
     A.1 Action set split       split_actions
     B   engineered             engineered_representations
     B   Fig. 4 (quadrants)     action_labels
-    A.1 Reward, Eq. 1          goal_reward, GridWorldEnv.step
+    A.1 State                  LAYOUTS, GridWorldEnv._observe
+    A.1 Reward, Eq. 1          GridWorldEnv.step
     A.1 Action observations    action_observations
     Table 3 (50 actions, 10)   NUM_AVAILABLE, MAX_SKILLS
 """
 
 import functools
 import heapq
-import itertools
 import operator
 import os
 from collections.abc import Sequence
@@ -69,7 +68,7 @@ PLAY_LOW, PLAY_HIGH = 1, 78  # A.1: 80x80 grid; published code: its ring is wall
 # ---- A.1 Actions, action set split; B: what is known about them ----
 MOVE_NAMES = "RDLU"  # published code: right, down, left, up are the moves 0..3
 MOVE_DELTAS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  # (4, 2): (dx, dy)
-# published code: the id of a skill in base 4, first move last: 0 = RRRRR, 1 = DRRRR, 4 = RDRRR.
+# published code: ids in base 4, the first move is the lowest digit: 0 = RRRRR, 1 = DRRRR.
 SKILL_MOVES = np.arange(NUM_ACTIONS)[:, None] // 4 ** np.arange(SKILL_LENGTH) % 4  # (1024, 5)
 SKILL_NAMES = ["".join(MOVE_NAMES[move] for move in moves) for moves in SKILL_MOVES]
 # The same moves as steps from one cell number to the next, as plain integers (fast to go through).
@@ -101,7 +100,9 @@ def engineered_representations(variant: str = "12d") -> np.ndarray:
     tables = {
         "12d": np.column_stack([deltas.sum(1), deltas.reshape(NUM_ACTIONS, 10)]),
         "5d": SKILL_MOVES * 2 / 3 - 1,
-        "path": deltas.cumsum(1).reshape(NUM_ACTIONS, 10),  # ours: for skills, what 12d is to moves
+        "path": deltas.cumsum(1).reshape(
+            NUM_ACTIONS, 10
+        ),  # ours: alike if they pass the same cells
     }
     if variant not in tables:
         raise ValueError(f"variant {variant!r} is unknown; there are {', '.join(tables)}")
@@ -134,27 +135,18 @@ def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
     return ids.astype(np.int64)
 
 
-# ---- A.1 State: the layouts; what a skill does in them; Eq. 1 ----
+# ---- A.1 State: the grids; what a skill does in them ----
 
-
-def build_layouts() -> np.ndarray:
-    """The 2 x 3 x 7 = 42 grids without the agent, uint8 (42, 81); all of them can be solved.
-
-    Number 7 * (river - 3) + opening - 1; plus 21 when the river is a row.
-    """
-    layouts = []
-    for is_row, river, opening in itertools.product((False, True), RIVERS, OPENINGS):
-        grid = np.full((SIZE, SIZE), EMPTY, np.uint8)  # [x, y]
-        grid[[0, -1]] = grid[:, [0, -1]] = WALL
-        grid[7, 7] = GOAL  # A.1: bottom right corner
-        grid[river, 1:-1] = LAVA
-        grid[river, opening] = SUBGOAL
-        # The goal lies on the diagonal: turning a column into a row leaves it where it is.
-        layouts.append((grid.T if is_row else grid).reshape(SIZE * SIZE))  # (81,): x * 9 + y
-    return np.stack(layouts)
-
-
-LAYOUTS = build_layouts()
+# The 2 x 3 x 7 = 42 layouts without the agent. Start and goal lie outside of every river, so each
+# can be solved. Number: 7 * (river - 3) + opening - 1, and 21 more when the river is a row.
+LAYOUTS = np.full((2, len(RIVERS), len(OPENINGS), SIZE, SIZE), EMPTY, np.uint8)  # [..., x, y]
+LAYOUTS[..., [0, -1], :] = LAYOUTS[..., [0, -1]] = WALL
+LAYOUTS[..., 7, 7] = GOAL  # A.1: bottom right corner
+for i, j in np.ndindex(len(RIVERS), len(OPENINGS)):
+    LAYOUTS[0, i, j, RIVERS[i], 1:-1] = LAVA  # a column: one x, all y
+    LAYOUTS[0, i, j, RIVERS[i], OPENINGS[j]] = SUBGOAL
+LAYOUTS[1] = LAYOUTS[0].swapaxes(2, 3)  # the same as rows; the goal is on the diagonal and stays
+LAYOUTS = LAYOUTS.reshape(-1, SIZE * SIZE)  # (42, 81): cell (x, y) at index x * 9 + y
 
 
 def walk(grid: list[int], cell: int, skill: int) -> list[int]:
@@ -172,13 +164,6 @@ def walk(grid: list[int], cell: int, skill: int) -> list[int]:
     return cells
 
 
-def goal_reward(moves: int) -> float:
-    """Goal part of Eq. 1: `moves` is N_total, bumps and the move onto the goal included."""
-    # appendix: (1 - 0.9) * N/50; published code: 1 - 0.9 * N/50; we do the latter, because the
-    # printed form pays more for a longer path, against its own text ("encourage a shorter path").
-    return 1 - LAMBDA_GOAL * moves / MAX_MOVES
-
-
 # ---- A.1 the environment ----
 
 
@@ -190,8 +175,7 @@ class GridWorldEnv(gym.Env):
     subgoal. Moves are absolute and deterministic. A move into a wall does nothing, but counts.
 
     ## Action Space
-    `Discrete(K)`: a position in `available`. The skill there makes five moves, fewer if it enters
-    the goal or lava.
+    `Discrete(K)`: a position in `available`. The skill's five moves are cut short by goal or lava.
 
     ## Observation Space
     `Dict(state=Box(0, 11, (81,), uint8), available=Box(0, 1023, (K,), int64))`. `state[x * 9 + y]`
@@ -207,8 +191,7 @@ class GridWorldEnv(gym.Env):
     replacement. With K = size of the pool, `available` is the pool in ascending order, always.
 
     ## Episode End
-    `terminated` on the goal or on lava; `truncated` after 10 skills (50 moves). The last info holds
-    `success`, 1.0 or 0.0.
+    `terminated` on goal or lava, `truncated` after 10 skills. The last info: `success`, 0.0 or 1.0.
 
     ## Arguments
     `action_pool`: distinct ids (default: the training skills). `num_available`: K (Table 3: 50).
@@ -221,25 +204,24 @@ class GridWorldEnv(gym.Env):
     def __init__(self, action_pool=None, num_available=NUM_AVAILABLE, render_mode=None):
         pool = split_actions()["train"] if action_pool is None else action_pool
         self.action_pool = np.sort(check_ids(pool, num_available))
-        self.num_available = num_available
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode {render_mode!r} is unknown; there is 'rgb_array'")
-        self.render_mode = render_mode
+        self.num_available, self.render_mode = num_available, render_mode
         self.observation_space = gym.spaces.Dict(
             state=gym.spaces.Box(0, SUBGOAL, (SIZE * SIZE,), np.uint8),
             available=gym.spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
         )
         self.action_space = gym.spaces.Discrete(num_available)
         self.trace = []  # cells of the last skill, its start first; empty before the first reset
-        self.over = True
+        self.over = True  # nothing to step before the first reset
 
     def reset(self, *, seed=None, options=None):
         """Draw a layout and the skills on offer; returns (observation, {})."""
         super().reset(seed=None if seed is None else operator.index(seed))  # numpy integers, too
-        drawn = int(self.np_random.integers(len(LAYOUTS)))
-        self.layout = (options or {}).get("layout", drawn)
+        drawn = self.np_random.integers(len(LAYOUTS))
+        self.layout = operator.index((options or {}).get("layout", drawn))
         if self.layout not in range(len(LAYOUTS)):
-            raise ValueError(f"layout is {self.layout!r}; there are 0..{len(LAYOUTS) - 1}")
+            raise ValueError(f"layout is {self.layout}; there are 0..{len(LAYOUTS) - 1}")
         # published code: draws sets from the system's entropy; ours: from the seeded generator.
         self.available = pool = self.action_pool  # all of them: a position keeps its meaning
         if self.num_available < len(pool):
@@ -265,7 +247,9 @@ class GridWorldEnv(gym.Env):
             self.subgoal_taken = True
             reward += LAMBDA_SUBGOAL
         if success := kinds[-1] == GOAL:
-            reward += goal_reward(self.moves)
+            # appendix: (1 - 0.9) * N/50; published code: 1 - 0.9 * N/50; we do the latter, because
+            # the printed form pays more for a longer path, against its text ("a shorter path").
+            reward += 1 - LAMBDA_GOAL * self.moves / MAX_MOVES
         terminated = success or kinds[-1] == LAVA
         # published code: the limit is a true end. We report `truncated`; the learner may treat
         # both alike. It falls on the last move of a skill: 10 skills of 5 moves are 50 moves.
@@ -291,11 +275,7 @@ class GridWorldEnv(gym.Env):
             return []
         if not self.trace:
             raise gym.error.ResetNeeded("call reset() before the first picture")
-        made = len(self.trace) - 1  # moves of this skill
-        return [
-            draw_frame(self.grid, self.trace[: t + 1], self.skill, self.moves - made + t)
-            for t in range(min(made, 1), made + 1)
-        ]
+        return [draw_frame(self, done) for done in range(1, len(self.trace)) or [0]]
 
 
 gym.register("ActionGen/GridWorld-v0", entry_point="gridworld:GridWorldEnv")
@@ -343,55 +323,51 @@ def action_observations(action_ids, num_observations=1024, modality="xy", seed=0
 
 # ---- pictures for people (Figure 1) ----
 
-FINE = 4  # ours: drawn 4 times larger, then averaged down, so that edges are smooth
-CELL = 40 * FINE  # ours: about the size of Figure 1 on a screen
+CELL = 160  # ours: drawn 4 times larger than shown, then averaged down, so that edges are smooth
 COLORS = {EMPTY: "#17191d", WALL: "#6f7378", GOAL: "#35b44a",
           LAVA: "#f5821f", SUBGOAL: "#2f6fe4", AGENT: "#ee2b2b"}  # fmt: skip
 LINE, TRAIL, KEY, TEXT, DIM, WAVE = "#3c4046", "#8f2c2c", "#2a2d33", "#f2f2f2", "#80858c", "#a94a06"
 
 
-def draw_frame(grid: list[int], cells: list[int], skill: int | None, moves: int) -> np.ndarray:
-    """Figure 1, the skill and the move counter below, the state at the right: uint8 (420, 600, 3).
+def draw_frame(env: GridWorldEnv, done: int) -> np.ndarray:
+    """Figure 1 after `done` moves of the last skill, the state beside: uint8 (420, 600, 3).
 
-    `cells`: from the start of the skill to where the agent is; `skill`: None after a reset.
-    The policy looks between skills only, so its state shows the agent where the skill began.
+    The policy looks between skills only: in its state the agent is where the skill began.
     """
-    image = Image.new("RGB", (600 * FINE, 420 * FINE), COLORS[EMPTY])
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(15 * FINE)
-    draw.rectangle((SIZE * CELL + FINE, 0, *image.size), KEY)
-    draw.text((480 * FINE, 64 * FINE), "what the policy saw: 81 ids", TEXT, font, "mm")
-    for cell, kind in enumerate(grid):
-        x, y = np.multiply(divmod(cell, SIZE), CELL)
-        draw.rectangle((x, y, x + CELL, y + CELL), COLORS[kind], LINE, FINE)
-        for height in (0.3, 0.5, 0.7) if kind == LAVA else ():
-            wave = [(0.1, 0.05), (0.3, -0.05), (0.5, 0.05), (0.7, -0.05), (0.9, 0.05)]
-            points = [(x + dx * CELL, y + (height + dy) * CELL) for dx, dy in wave]
-            draw.line(points, WAVE, 2 * FINE, "curve")
-        x, y = np.multiply(divmod(cell, SIZE), 24 * FINE) + (372 * FINE, 92 * FINE)
-        draw.rectangle((x, y, x + 24 * FINE, y + 24 * FINE), COLORS[EMPTY], LINE, FINE)
-        seen = AGENT if cell == cells[0] else kind
-        color = DIM if seen in (EMPTY, WALL) else COLORS[seen]
-        draw.text((x + 12 * FINE, y + 12 * FINE), str(seen), color, font, "mm")
-    path = (np.array([divmod(cell, SIZE) for cell in cells]) + 0.5) * CELL  # (moves + 1, 2)
-    draw.line(path.ravel().tolist(), TRAIL, 4 * FINE, "curve")
+    image = Image.new("RGB", (2400, 1680), COLORS[EMPTY])
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(60)
+    draw.rectangle((1444, 0, 2400, 1680), KEY)
+    draw.text((1920, 256), "what the policy saw: 81 ids", TEXT, font, "mm")
+    for cell, kind in enumerate(env.grid):
+        column, row = divmod(cell, SIZE)
+        x, y = column * CELL, row * CELL
+        draw.rectangle((x, y, x + CELL, y + CELL), COLORS[kind], LINE, 4)
+        for height in (48, 80, 112) if kind == LAVA else ():
+            wave = [(x + 16 + 32 * i, y + height - 8 * (-1) ** i) for i in range(5)]
+            draw.line(wave, WAVE, 8, "curve")
+        x, y = 1536 + column * 96, 416 + row * 96
+        draw.rectangle((x - 48, y - 48, x + 48, y + 48), COLORS[EMPTY], LINE, 4)
+        seen = AGENT if cell == env.trace[0] else kind
+        draw.text((x, y), str(seen), DIM if seen in (EMPTY, WALL) else COLORS[seen], font, "mm")
+    path = [divmod(cell, SIZE) for cell in env.trace[: done + 1]]
+    path = (np.array(path) + 0.5) * CELL  # (done + 1, 2)
+    draw.line(path.ravel().tolist(), TRAIL, 16, "curve")
     for x, y in path[:-1]:
-        draw.ellipse((x - 5 * FINE, y - 5 * FINE, x + 5 * FINE, y + 5 * FINE), TRAIL)
-    done = len(cells) - 1
-    heading = float(SKILL_MOVES[skill, done - 1]) if done else 0.0
+        draw.ellipse((x - 20, y - 20, x + 20, y + 20), TRAIL)
     # A triangle as in Figure 1. Pillow's first one points up and turns against the clock.
-    triangle = (*path[-1], 0.4 * CELL)
-    draw.regular_polygon(triangle, 3, -90 * (heading + 1), COLORS[AGENT], "#5c0d0d", FINE)
-    for t, letter in enumerate(SKILL_NAMES[skill] if done else " " * SKILL_LENGTH):
-        x, y = (14 + 37 * t) * FINE, SIZE * CELL + 14 * FINE
+    heading = int(SKILL_MOVES[env.skill, done - 1]) if done else 0
+    draw.regular_polygon((*path[-1], 64), 3, -90 * (heading + 1), COLORS[AGENT], "#5c0d0d", 4)
+    for t, letter in enumerate(SKILL_NAMES[env.skill] if done else " " * SKILL_LENGTH):
+        x, y = 120 + 148 * t, 1560
         fill = COLORS[AGENT] if t == done - 1 else KEY  # the present move is lit
-        draw.rounded_rectangle((x, y, x + 32 * FINE, y + 32 * FINE), 6 * FINE, fill, LINE, FINE)
-        color = TEXT if t < done else DIM
-        draw.text((x + 16 * FINE, y + 16 * FINE), letter, color, font, "mm")
-    draw.text((346 * FINE, 381 * FINE), f"move {moves} / {MAX_MOVES}", TEXT, font, "rm")
-    kind = grid[cells[-1]]
+        draw.rounded_rectangle((x - 64, y - 64, x + 64, y + 64), 24, fill, LINE, 4)
+        draw.text((x, y), letter, TEXT if t < done else DIM, font, "mm")
+    moves = env.moves - len(env.trace) + 1 + done
+    draw.text((1384, 1524), f"move {moves} / {MAX_MOVES}", TEXT, font, "rm")
+    kind = env.grid[env.trace[done]]
     word = {SUBGOAL: "subgoal", GOAL: "goal reached", LAVA: "lava"}.get(kind, "")
-    draw.text((346 * FINE, 400 * FINE), word, COLORS[kind], font, "rm")
-    return np.array(image.reduce(FINE))
+    draw.text((1384, 1600), word, COLORS[kind], font, "rm")
+    return np.array(image.reduce(4))
 
 
 def draw_sheet(path: Path, pool: np.ndarray, seed: int) -> None:
@@ -469,9 +445,9 @@ def main(args: Args) -> None:
     env = GridWorldEnv(pool, args.num_available, "rgb_array")
     for name in ("planned", "random"):
         env.reset(seed=args.seed)
-        plan = env.np_random.integers(args.num_available, size=MAX_SKILLS)
-        if name == "planned" and not (plan := best_plan(env.layout, env.available)):
-            print("the skills on offer do not lead to the goal")
+        plan = best_plan(env.layout, env.available)  # empty where nothing leads to the goal
+        if name == "random":
+            plan = env.np_random.integers(args.num_available, size=MAX_SKILLS)
         frames = env.render_frames()
         for action in plan:
             _, reward, terminated, truncated, _ = env.step(action)
