@@ -370,7 +370,7 @@ def draw_frame(env: GridWorldEnv, done: int) -> np.ndarray:
 def draw_sheet(path: Path, pool: np.ndarray, seed: int) -> None:
     """One picture: the layouts, where skills lead, recordings of one skill of each quadrant."""
     # An inherited backend (a notebook's) that is not installed would make the import fail.
-    os.environ["MPLBACKEND"] = "agg"
+    os.environ.pop("MPLBACKEND", None)
     from matplotlib.figure import Figure  # here: training needs no pictures
 
     figure, labels = Figure((15, 6), layout="constrained"), action_labels()
