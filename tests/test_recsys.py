@@ -98,18 +98,13 @@ def test_no_product_is_on_both_sides_of_the_split(seed):
     assert seed == 0 or not np.array_equal(split["test"], TEST)
 
 
-def test_fully_observable_adds_popularity_in_the_scale_of_the_rest():
+def test_representations_are_c_and_with_full_observability_a_third_of_mu():
     c, full = recsys.engineered_representations(), recsys.engineered_representations(True)
     assert c.shape == (10_000, 16) and full.shape == (10_000, 17)
     assert c.dtype == full.dtype == np.float32
     assert np.array_equal(full[:, :16], c)
     np.testing.assert_allclose(full[:, 16] * 3, recsys.POPULARITY, rtol=1e-6)
-    c[:] = 0  # a copy: nobody can change the products
-    assert np.abs(recsys.PRODUCTS).max() > 0
-
-
-def test_nobody_observes_products():
-    assert recsys.MODALITIES == ()
+    assert recsys.MODALITIES == ()  # nobody observes products
     with pytest.raises(ValueError, match="no action observations; use engineered"):
         recsys.action_observations(TEST, 4, "state")
 
@@ -262,6 +257,10 @@ def test_time_is_up_after_100_recommendations(monkeypatch):
     assert flags == [(False, False)] * 99 + [(False, True)] and env.ending == "time is up"
     with pytest.raises(gym.error.ResetNeeded):
         env.step(0)
+    env.reset()
+    env.session, env.recommendations = GONE, 99
+    always(monkeypatch, 0)
+    assert env.step(0)[2:4] == (True, False)  # who leaves in the last step has left
 
 
 def test_offers_are_uniform_sorted_and_new_in_every_episode():
@@ -374,9 +373,9 @@ def test_the_text_tells_the_episode():
     assert all("organic" in line for line in lines if "CLICK" in line)
     (user, product, click), *_ = (event for event in env.timeline if event[1] != PAGE_VIEW)
     taste, mu = recsys.PRODUCTS[product] @ user, recsys.POPULARITY[product]
-    told = f"rec   1: product {product:4}  taste {taste:+.1f}  popularity {mu:+5.1f}  p .60  "
+    told = f"rec   1: product {product:4}  taste {taste:+.1f}  popularity {mu:+5.1f}  p .18  "
     assert lines[0].startswith(told + ("CLICK" if click else "no click"))
-    assert recsys.click_probability(taste + mu) == pytest.approx(0.60, abs=0.005)
+    assert recsys.click_probability(taste + mu) == pytest.approx(0.18, abs=0.005)
 
 
 def test_pictures_have_one_size_and_change():
@@ -407,3 +406,5 @@ def test_the_script_runs_anywhere_and_with_a_notebooks_display(tmp_path):
     done = subprocess.run(bad, **options)
     assert done.returncode == 1 and done.stderr.startswith("error: 3000 actions on offer")
     assert done.stderr.count("\n") == 1 and not list((tmp_path / "other").iterdir())
+    with pytest.raises(ValueError, match="episodes is 0"):
+        recsys.main(recsys.Args(episodes=0, out=tmp_path / "none"))
