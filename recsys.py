@@ -2,8 +2,7 @@
 
 The agent recommends one product after another to a user and earns 1 for every click. It sees the
 user as a vector of 16 numbers and every product as another one; it does not see how popular a
-product is. In every episode 500 products are on offer; at test time they are products never used
-in training.
+product is. Every episode offers 500 products; at test time none of them was used in training.
 
       reset                   0.05, and after every click
         |                    +---------------------------+
@@ -14,14 +13,13 @@ in training.
                          v                                v
                         gone                             gone
 
-Each of these draws also moves the user vector a little. The episode ends when the user is gone, or
-after 100 recommendations.
+Each draw also moves the user vector a little. After 100 recommendations the episode ends, too.
 
 Commands:
 
     python recsys.py                    # one episode as text and GIF, the click curve (6 s)
     python recsys.py --policy oracle --pool train --num-available 50 --seed 3
-    python recsys.py --episodes 10000   # floors and ceilings as quoted at POLICIES (3 min)
+    python recsys.py --episodes 10000   # floors and ceilings as quoted at POLICIES (1 min)
 
 Paper map (appendix -> here):
 
@@ -295,6 +293,7 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 # Each scores the products on offer, (K,), from taste c.v (K,) and popularity mu (K,); the best is
 # recommended. The oracle knows all. c-only is the ceiling for unseen products when mu is hidden.
+# CTR with 500 of the test products on offer: 0.158, 0.302, 0.633, 0.658 (standard errors 0.002).
 POLICIES = {
     "random": lambda taste, mu, rng: rng.random(len(mu)),
     "c-only": lambda taste, mu, rng: taste,
