@@ -218,9 +218,8 @@ def test_gymnasiums_wrappers_work(module, tmp_path, monkeypatch):
     env = make(module, render_mode="rgb_array")
     flat = gym.spaces.flatdim(env.observation_space)
     env = wrappers.RecordVideo(env, str(tmp_path), episode_trigger=lambda episode: True)
-    env = wrappers.FlattenObservation(
-        wrappers.TimeLimit(wrappers.RecordEpisodeStatistics(env), max_episode_steps=2)
-    )
+    env = wrappers.RecordEpisodeStatistics(wrappers.TimeLimit(env, max_episode_steps=2))
+    env = wrappers.FlattenObservation(env)
     observation, _ = env.reset(seed=0)
     assert observation.shape == (flat,)
     env.action_space.seed(0)
