@@ -217,7 +217,7 @@ def test_gymnasiums_wrappers_work(module, tmp_path, monkeypatch):
     sys.modules[name].ImageSequenceClip = Clip
     env = make(module, render_mode="rgb_array")
     flat = gym.spaces.flatdim(env.observation_space)
-    env = wrappers.RecordVideo(env, str(tmp_path), episode_trigger=lambda episode: True)
+    env = wrappers.RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda episode: True)
     env = wrappers.RecordEpisodeStatistics(wrappers.TimeLimit(env, max_episode_steps=2))
     env = wrappers.FlattenObservation(env)
     observation, _ = env.reset(seed=0)
