@@ -4,18 +4,18 @@ A two-dimensional physics puzzle. Balls fall. Every 40 physics steps the agent p
 tools on offer and a place for it, so that the red target ball reaches the green goal. There are
 twelve tasks and 2,111 tools, and 6,248 more for the Full Split and the analyses.
 
-    python create_env.py --task push            # the best of 400 random episodes as a GIF, beside it
-                                                # what the policy sees (4 s; --tries 1: a typical one)
-    python create_env.py --play --task push     # place the tools yourself: mouse, arrows, space
-    python create_env.py --all-tasks            # Figure 7: the 12 tasks on one sheet
-    python create_env.py --show-tools           # four tools of each class
-    python create_env.py --show-probe Cannon    # probe-ball trajectories over a tool (class or id)
+    python create_env.py --task push           # the best of 400 random episodes as a GIF, beside
+                                               # it what the policy sees (--tries 1: a typical one)
+    python create_env.py --play --task push    # place the tools yourself: mouse, arrows, space
+    python create_env.py --all-tasks           # Figure 7: the 12 tasks on one sheet
+    python create_env.py --show-tools          # four tools of each class
+    python create_env.py --show-probe Cannon   # probe-ball trajectories over a tool (class or id)
 
 Paper map
-    A.3 actions              KINDS, TOOLS               A.3 state        strokes(), CreateEnv._observe()
-    A.3 splits, Table 1      split_actions()            A.3 Eq. 3        CreateEnv._reward()
-    A.3 action observations  action_observations()      B (labels)       action_labels()
-    C.1, Figure 7            TASKS                      C.3              subgoal_reward=False
+    A.3 actions              KINDS, TOOLS               A.3 state     strokes(), CreateEnv
+    A.3 splits, Table 1      split_actions()            A.3 Eq. 3     CreateEnv._reward()
+    A.3 action observations  action_observations()      B (labels)    action_labels()
+    C.1, Figure 7            TASKS                      C.3           subgoal_reward=False
 
 Units: the world is a square of 84 x 84 units, one unit per pixel of the observation, x to the
 right, y up, origin in the lower left corner. "norm" means agent coordinates: unit = (norm + 1) 42.
@@ -24,18 +24,17 @@ Angles are degrees counter-clockwise in the tables and radians in the physics.
 A task of your own is an entry of TASKS, in this file or in yours:
 
     TASKS["gap"] = Task(
+        target=ball("Target", -0.6, 0.6, "target"), goal=star(0.7, -0.1),
         items=(line(-0.5, 0.1, 34), line(0.7, -0.2, 20)),  # x, y (norm), length (units)
-        target=ball("Target", -0.6, 0.6, "target"),
-        goal=star(0.7, -0.1),
         shifts={"target": (0.1, 0.0)},  # the target's x moves by U(-0.1, 0.1) at every reset
     )
 
 A tool of your own is one line of KINDS. It gets the ids after all others and a 2:1:1 split:
 
-    "Octagon": Kind("polygon", 159, ORANGE, 45, "octagon", "", POLYGONS, sides=8),
+    "Octagon": Kind("polygon", 159, ORANGE, 45, "octagon", "", POLYGONS, 8),
 
-What it does to a ball is a contact rule (`make_space`). Mind that pymunk prints an exception in a
-contact rule and swallows it: the run goes on as if the rule were not there. So watch stderr.
+What it does to a ball is a contact rule (`make_space`). Mind that pymunk prints an exception in a contact
+rule and swallows it: the run goes on as if the rule were not there. So watch stderr.
 """
 
 import colorsys
@@ -48,7 +47,7 @@ import math
 import multiprocessing
 import operator
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -85,6 +84,8 @@ STILL_SPEED = 0.05  # published code, units/s: slower than this is "not moving"
 STILL_ACTIONS = 2  # published code: so many action ends without motion, in a row or not, are "over"
 HIT_DISTANCE = 0.03  # published code, share of the screen's diagonal: then the target counts as hit
 
+PICTURE_EVERY = 8  # ours, physics steps: 5 colour pictures per action
+
 BALL_RADIUS, BALL_MASS = 4.0, 10.0  # published code: target, marker, goal and probe ball
 PLANK_MASS, PLANK_MOMENT = 10.0, 10_000.0  # published code: levers and see-saws, very sluggish
 LADDER_ANGLE = 95.0  # published code, degrees
@@ -98,7 +99,7 @@ MODALITIES = ("xy", "state", "video")  # B: (x, y) of the ball is the default
 # ---- A.3 actions: the tools ----
 
 
-# Collision types: which pairs of shapes have a rule of their own (see RULES). MOVING: balls, boxes.
+# Collision types: which pairs of shapes have a rule of their own (`make_space`). MOVING: balls, boxes.
 NAMES = "PLAIN MOVING CANNON FAN BELT LADDER FUNNEL BUCKET PLANK GOAL"
 Contact = enum.IntEnum("Contact", NAMES, start=0)
 # Balls pass through these; only their rule acts.
@@ -207,7 +208,6 @@ ID_ORDER = (
     # the Full Split alone
     *("Ball", "Bouncy Ball", "Lever", "Conveyor Belt"),
 )
-COARSE, FINE = 15, 3  # degrees between neighbours: A.3 "no two within 15 degrees"; the analyses
 FIRST_LIMIT = 5  # published code, degrees: see-saw limits are 5, 20, 35, ...
 
 
@@ -222,34 +222,23 @@ def _tools_of(name: str, step: int) -> list[Tool]:
     return [Tool(name, **dict(zip(kind.vary, row, strict=True))) for row in rows]
 
 
-def _generate_tools() -> list[Tool]:
-    """The whole action set; a tool's place in the list is its id.
-
-    0 is the no-op; 1..2,110 are the tools of the Default Split (with the no-op A.3's 2,111);
-    2,111..2,325 the classes of the Full Split alone; the rest only in the analyses at 3 degrees.
-    """
-    # appendix: lists lever, ball and belt among the 2,111; published code: its 2,111 hold none of
-    # them (with them there would be 2,326). We keep 2,111 and give the others the ids after it.
-    tools = [Tool("No-op")]
-    for name in ID_ORDER:
-        tools += _tools_of(name, COARSE)
-    known = set(tools)
-    for name in ID_ORDER:  # published code: the analyses use the classes that both splits have
-        if KINDS[name].group and KINDS[name].table1:
-            tools += [tool for tool in _tools_of(name, FINE) if tool not in known]
-    for name, kind in KINDS.items():
-        if kind.vary and name not in ID_ORDER:
-            tools += _tools_of(name, COARSE)
-    return tools
-
-
-TOOLS = _generate_tools()
+# A tool's place in the list is its id. 0 is the no-op; 1..2,110 are the tools of the Default Split
+# (with the no-op A.3's 2,111); 2,111..2,325 the classes of the Full Split alone. Appendix: lists
+# lever, ball and belt among the 2,111; published code: its 2,111 hold none of them (with them there
+# would be 2,326). We keep 2,111 and give the others the ids after it.
+_COARSE = [Tool("No-op"), *(tool for name in ID_ORDER for tool in _tools_of(name, 15))]
+_KNOWN = set(_COARSE)
+# Then the analyses' tools at 3 degrees. Published code: of the classes that both splits have.
+_BOTH = [name for name in ID_ORDER if KINDS[name].group and KINDS[name].table1]
+_FINE = [t for name in _BOTH for t in _tools_of(name, 3) if t not in _KNOWN]
+_ADDED = [name for name, kind in KINDS.items() if kind.vary and name not in ID_ORDER]
+_OWN = [tool for name in _ADDED for tool in _tools_of(name, 15)]
+TOOLS = _COARSE + _FINE + _OWN
 NUM_ACTIONS = len(TOOLS)  # 8,359 distinct tools over all splits
 NO_OP = 0
+IS_COARSE = np.repeat([True, False, True], [len(_COARSE), len(_FINE), len(_OWN)])
 # What most tools are split by, (NUM_ACTIONS,): the angle, or a see-saw's limit from the first on.
-DEGREES = np.array(
-    [tool.max_angle - FIRST_LIMIT if tool.max_angle else tool.angle for tool in TOOLS]
-)
+DEGREES = np.array([t.max_angle - FIRST_LIMIT if t.max_angle else t.angle for t in TOOLS])
 
 
 def action_labels() -> np.ndarray:
@@ -271,7 +260,7 @@ def engineered_representations() -> np.ndarray:
     one_hot = np.array([[tool.kind == name for name in classes] for tool in TOOLS], np.float64)
     numbers = np.array([tool[1:] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])
-    coarse = numbers[DEGREES % COARSE == 0]
+    coarse = numbers[IS_COARSE]
     numbers = (numbers - coarse.mean(axis=0)) / coarse.std(axis=0)
     return np.concatenate([one_hot, numbers], axis=1).astype(np.float32)  # (NUM_ACTIONS, 30)
 
@@ -290,13 +279,10 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     split.
     """
     rng = np.random.default_rng(seed)
-    group, table1 = (
-        np.array([getattr(KINDS[tool.kind], name) for tool in TOOLS])
-        for name in ("group", "table1")
-    )
-    coarse = DEGREES % COARSE == 0
+    group = np.array([KINDS[tool.kind].group for tool in TOOLS])
+    table1 = np.array([KINDS[tool.kind].table1 for tool in TOOLS])
     if split == "default":
-        pool, train = coarse & (group != ""), np.zeros(NUM_ACTIONS, bool)
+        pool, train = IS_COARSE & (group != ""), np.zeros(NUM_ACTIONS, bool)
         sizes = np.array([tool.size for tool in TOOLS])
         for name in dict.fromkeys(group[pool].tolist()):
             members = pool & (group == name)
@@ -305,7 +291,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
             order = rng.permutation(np.unique(primary[members]))
             train |= members & np.isin(primary, order[: math.ceil(len(order) / 2)])
     elif split == "full":
-        pool, train = coarse & (table1 != ""), coarse & (table1 == "train")
+        pool, train = IS_COARSE & (table1 != ""), IS_COARSE & (table1 == "train")
     elif split == "analysis":
         # appendix: 7,566 tools; published code: 7,555 and the no-op. A misprint, we think.
         pool = (group != "") & (table1 != "")
@@ -738,34 +724,29 @@ def _on_plank(arbiter, space, data) -> None:
         ball.body.angular_velocity *= keep
 
 
-RULES = {  # (first shape, second shape): when, what
-    (Contact.GOAL, Contact.MOVING): ("pre_solve", _on_goal),
-    (Contact.MOVING, Contact.MOVING): ("begin", _on_goal),
-    (Contact.MOVING, Contact.BELT): ("pre_solve", _on_carrier),
-    (Contact.MOVING, Contact.LADDER): ("pre_solve", _on_carrier),
-    (Contact.MOVING, Contact.CANNON): ("begin", _on_cannon),
-    (Contact.MOVING, Contact.FAN): ("pre_solve", _on_fan),
-    (Contact.MOVING, Contact.FUNNEL): ("pre_solve", _on_funnel),
-    (Contact.MOVING, Contact.BUCKET): ("pre_solve", _on_bucket),
-    (Contact.MOVING, Contact.PLANK): ("post_solve", _on_plank),
-}
-
-
 def make_space() -> pymunk.Space:
     """An empty world with CREATE's gravity and contact rules, for the game and the probe ball."""
     space = pymunk.Space()  # 10 solver iterations and no damping are pymunk's defaults
     space.gravity, space.sleep_time_threshold = GRAVITY, SLEEP_TIME
-    for pair, (phase, rule) in RULES.items():
-        space.on_collision(*pair, **{phase: rule})
+    moving = Contact.MOVING
+    space.on_collision(Contact.GOAL, moving, pre_solve=_on_goal)
+    space.on_collision(moving, moving, begin=_on_goal)
+    space.on_collision(moving, Contact.BELT, pre_solve=_on_carrier)
+    space.on_collision(moving, Contact.LADDER, pre_solve=_on_carrier)
+    space.on_collision(moving, Contact.CANNON, begin=_on_cannon)
+    space.on_collision(moving, Contact.FAN, pre_solve=_on_fan)
+    space.on_collision(moving, Contact.FUNNEL, pre_solve=_on_funnel)
+    space.on_collision(moving, Contact.BUCKET, pre_solve=_on_bucket)
+    space.on_collision(moving, Contact.PLANK, post_solve=_on_plank)
     return space
 
 
 # ---- A.3 state: one table of strokes for the observation, the probe videos and people ----
 
 # A stroke is (points, width, grey, colour): points in units, y up. One point is a dot of that
-# width, several are a line with round ends, width 0 fills the polygon. Grey None: only people see
-# it; colour None: only the policy does. Greys follow the contact shape, plus the marks that tell a
-# direction (muzzle, blowing side, nozzle, opening, head of a belt).
+# width, several are a line with round ends. Width 0 fills a polygon, a negative one draws its edge.
+# Grey None: only people see it; colour None: only the policy does. Greys follow the contact shape,
+# plus the marks that tell a direction (muzzle, blowing side, nozzle, opening, head of a belt).
 Stroke = tuple[list, float, int | None, str | tuple | None]
 PAPER, INK, STEEL, DARK = "#fdfcf8", "#3b3a44", "#8d8a94", "#55525f"
 
@@ -787,160 +768,148 @@ def strokes(tool: Tool, pose: tuple[float, float, float]) -> list[Stroke]:
     kind, turned = KINDS[tool.kind], frame(x, y, angle)
     corners = [turned(u, v) for u, v in outline(tool)]
     at = frame(x, y, angle + math.radians(tool.angle))  # (along the aim, across)
-    return LOOKS[kind.family](tool, kind, corners, at)
+    return [*LOOKS[kind.family](tool, kind, kind.colour, corners, at)]
 
 
-def _look_round(tool, kind, corners, at):  # balls that move, ball tools, subgoals
-    (x, y), size, colour = at(0), float(tool.size), kind.colour
+def _look_round(tool, kind, colour, corners, at):  # balls that move, ball tools, subgoals
+    (x, y), size, subgoal = at(0), float(tool.size), tool.kind == "Subgoal"
     if tool.kind == "No-op":
-        return []
-    edge = "#8fd16a" if tool.kind == "Subgoal" else shade(colour, 0.7)
-    looks = [([(x, y)], 2 * size, kind.grey, edge), ([(x, y)], 2 * size - 0.9, None, colour)]
-    if kind.family == "disc":
-        face = "#a9e08a" if tool.kind == "Subgoal" else _face(tool, colour)
-        return [*looks, ([(x, y)], 0.9 * size, None, face)]
+        return
+    yield [(x, y)], 2 * size, kind.grey, "#8fd16a" if subgoal else shade(colour, 0.7)
+    yield [(x, y)], 2 * size - 0.9, None, colour
+    if kind.family == "disc":  # a paler middle, more so if it is bouncy
+        pale = "#a9e08a" if subgoal else shade(colour, 1.35 if tool.elasticity > 0.6 else 1.2)
+        yield [(x, y)], 0.8 * size if subgoal else size, None, pale
+        return
     reach, seam = 0.72 * size, shade(colour, 0.75, 150)  # a stripe shows the spin
-    looks.append(([at(-reach), at(reach)], 0.5, None, seam))
+    yield [at(-reach), at(reach)], 0.5, None, seam
     if tool.kind == "Basketball":
-        looks.append(([at(0, -reach), at(0, reach)], 0.5, None, seam))
-    glint = (x - 0.36 * size, y + 0.38 * size)
-    return [*looks, ([glint], 0.48 * size, None, (255, 255, 255, 170))]
+        yield [at(0, -reach), at(0, reach)], 0.5, None, seam
+    yield [(x - 0.36 * size, y + 0.38 * size)], 0.48 * size, None, (255, 255, 255, 170)
 
 
-def _face(tool: Tool, colour: str):  # the middle of a solid tool: brighter if it is bouncy
-    return shade(colour, 1.35 if tool.elasticity > max(SOFT) else 1.2)
-
-
-def _closed(points: list) -> list:
-    return [*points, points[0]]
-
-
-def _look_flat(tool, kind, corners, at):  # polygons, crates, the star
-    (x, y), colour = at(0), kind.colour
-    if tool.kind == "Goal star":  # in grey the pentagon that counts
+def _look_flat(tool, kind, colour, corners, at):  # polygons, crates, the star
+    (x, y), edge = at(0), shade(colour, 0.7)
+    if tool.kind == "Goal star":
         turns = [(4.3 if k % 2 == 0 else 1.9, math.pi * (0.5 + k / 5)) for k in range(10)]
         points = [(x + r * math.cos(a), y + r * math.sin(a)) for r, a in turns]
-        looks = [(corners, 0, kind.grey, None), ([(x, y)], 10.4, None, shade(colour, 1.5, 90))]
-        rim = (_closed(points), 0.45, None, shade(colour, 0.7))
-        return [*looks, (points, 0, None, colour), rim]
-    edge = shade(colour, 0.7)
-    looks = [(corners, 0, kind.grey, colour), (_closed(corners), 0.5, None, edge)]
+        yield corners, 0, kind.grey, None  # the pentagon that counts
+        yield [(x, y)], 10.4, None, shade(colour, 1.5, 90)
+        yield points, 0, None, colour
+        yield points, -0.45, None, edge
+        return
+    yield corners, 0, kind.grey, colour
+    yield corners, -0.5, None, edge
     if kind.family == "crate":
-        return [*looks, (corners[::2], 0.5, None, edge)]
-    inner = [(x + 0.55 * (u - x), y + 0.55 * (v - y)) for u, v in corners]
-    return [*looks, (inner, 0, None, _face(tool, colour))]
+        yield corners[::2], 0.5, None, edge
+    else:
+        inner = [(x + 0.55 * (u - x), y + 0.55 * (v - y)) for u, v in corners]
+        yield inner, 0, None, shade(colour, 1.35 if tool.elasticity > 0.6 else 1.2)
 
 
-def _look_bar(tool, kind, corners, at):  # ramps, floors; trampolines on legs; belts; ladders
-    colour, half, width = kind.colour, tool.size / 2, max(2 * kind.radius, 1.0)
-    bar = [(corners, width, kind.grey, shade(colour, 0.72)), (corners, 0.62 * width, None, colour)]
-    if tool.kind == "Trampoline":
-        below = -1 if math.cos(math.radians(tool.angle)) > -1e-9 else 1  # the side of the ground
-        for u, v in ((-0.75 * half, -0.825 * half), (0.75 * half, 0.825 * half)):
-            bar.insert(0, ([at(u), at(v, 2.6 * below)], 0.6, None, "#9aa0ac"))
-        bar[-1] = ([at(-half + 0.4), at(half - 0.4)], 0.8, None, "#8fb8ff")
+def _look_bar(tool, kind, colour, corners, at):  # ramps, walls; trampolines; belts; ladders
+    half, width = tool.size / 2, max(2 * kind.radius, 1.0)
     if tool.kind == "Ladder":
-        bar = [(corners, width, kind.grey, None)]
-        bar += [([at(-half, v), at(half, v)], 0.7, None, colour) for v in (-1.3, 1.3)]
+        yield corners, width, kind.grey, None
+        for v in (-1.3, 1.3):
+            yield [at(-half, v), at(half, v)], 0.7, None, colour
         for k in range(int(half // 1.25)):
             u = 1.25 + 2.5 * k - half
-            bar.append(([at(u, -1.3), at(u, 1.3)], 0.5, None, colour))
+            yield [at(u, -1.3), at(u, 1.3)], 0.5, None, colour
+        return
+    if tool.kind == "Trampoline":  # on legs
+        below = -1 if math.cos(math.radians(tool.angle)) > -1e-9 else 1  # the side of the ground
+        for u in (-0.75 * half, 0.75 * half):
+            yield [at(u), at(1.1 * u, 2.6 * below)], 0.6, None, "#9aa0ac"
+    yield corners, width, kind.grey, shade(colour, 0.72)
+    yield corners, 0.62 * width, None, "#8fb8ff" if tool.kind == "Trampoline" else colour
     if tool.kind == "Conveyor Belt":
         way, rollers = math.copysign(1, tool.speed), max(2, int(half // 1.2))
-        spots = [at(half * (2 * k / rollers - 1)) for k in range(rollers + 1)]
-        bar += [([spot], 1.1, None, "#c9cad6") for spot in spots]
-        bar.append(([corners[tool.speed > 0]], 3.6, kind.grey, None))
+        yield [corners[tool.speed > 0]], 3.6, kind.grey, None
+        for k in range(rollers + 1):
+            yield [at(half * (2 * k / rollers - 1))], 1.1, None, "#c9cad6"
         for k in range(1 + abs(round(tool.speed)) // 3):  # one to three arrow heads, by speed
             u = way * (1.6 * k - 0.4)
-            head = [at(u - 0.8 * way, 3.0), at(u, 2.2), at(u - 0.8 * way, 1.4)]
-            bar.append((head, 0.4, None, colour))
-    return bar
+            yield [at(u - 0.8 * way, 3), at(u, 2.2), at(u - 0.8 * way, 1.4)], 0.4, None, colour
 
 
-def _look_plank(tool, kind, corners, at):  # foot, plank, bolt, weight; with a limit also a plate
+def _look_plank(tool, kind, colour, corners, at):  # levers and see-saws
     (x, y), ends = at(0), corners[:2]
-    looks = [([(x, y), (x - 2.0, y - 2.0), (x + 2.0, y - 2.0)], 0, kind.grey, None)]
-    looks.append(([(x, y), (x - 2.2, y - 3.0), (x + 2.2, y - 3.0)], 0, None, STEEL))
-    if tool.max_angle:
-        looks.append(([(x - 2.9, y - 3.1), (x + 2.9, y - 3.1)], 0.7, None, DARK))
-    looks += [
-        (ends, 1.0, kind.grey, None),
-        (ends, 1.5, None, "#9c6b30"),
-        (ends, 0.9, None, "#e0a35c"),
-    ]
+    yield [(x, y), (x - 2, y - 2), (x + 2, y - 2)], 0, kind.grey, None
+    yield [(x, y), (x - 2.2, y - 3), (x + 2.2, y - 3)], 0, None, STEEL
+    if tool.max_angle:  # a plate tells a see-saw from a lever
+        yield [(x - 2.9, y - 3.1), (x + 2.9, y - 3.1)], 0.7, None, DARK
+    yield ends, 1.0, kind.grey, None
+    yield ends, 1.5, None, "#9c6b30"
+    yield ends, 0.9, None, "#e0a35c"
     for point in corners[2:]:
-        heavy = 2.4 + 0.14 * tool.mass  # only people see how heavy
-        looks += [([point], 3.0, kind.grey, None), ([point], heavy, None, "#2f2d38")]
-        looks.append(([point], heavy - 0.6, None, "#4c4a57"))
-    return [*looks, ([(x, y)], 1.4, None, DARK)]
+        yield [point], 3.0, kind.grey, None
+        yield [point], 2.4 + 0.14 * tool.mass, None, "#2f2d38"  # only people see how heavy
+        yield [point], 1.8 + 0.14 * tool.mass, None, "#4c4a57"
+    yield [(x, y)], 1.4, None, DARK
 
 
-def _look_box(tool, kind, corners, at):  # cannon, fan, basket
-    colour, dark = kind.colour, shade(kind.colour, 0.62)
-    if tool.kind == "Cannon":  # a barrel on a wheel; in grey the box that counts, its mouth white
-        looks = [(corners, 0, kind.grey, None), ([at(3.5)], 3.0, 255, None)]
-        for grow, ink in ((0.5, dark), (0.0, colour)):
-            back, front = 2.7 + grow, 2.1 + grow
-            barrel = [
-                at(-2.2, back),
-                at(-2.2, -back),
-                at(4.2 + grow, -front),
-                at(4.2 + grow, front),
-            ]
-            looks += [([at(-2.2)], 2 * back, None, ink), (barrel, 0, None, ink)]
-        looks.append(([at(-2.0, 1.5), at(3.6, 1.2)], 0.7, None, shade(colour, 1.35)))
-        lip = [at(3.9, 3.5), at(3.9, -3.5), at(5.0, -3.5), at(5.0, 3.5)]
-        looks += [(lip, 0, None, shade(colour, 0.5)), ([at(-2.2)], 3.0, None, "#4a3526")]
-        return [*looks, ([at(-2.2)], 2.3, None, "#6b4f3a")]
-    looks = [(_closed(corners), 1.0, kind.grey, None)]
-    if tool.kind == "Fan":  # a rotor at the back, and its wind, longer for a stronger fan
-        axle = [at(-3.3, 1.1), at(-3.3, -1.1), at(-1.9, -0.8), at(-1.9, 0.8)]
-        looks += [
-            ([at(0), at(3.35)], 1.6, kind.grey, None),
-            (corners, 0, None, shade(colour, 1.85, 150)),
-        ]
-        looks.append((axle, 0, None, dark))
-        for side in (1, -1):
-            blade = [at(-1.9), at(-1.0, 1.6 * side), at(-1.5, 4.6 * side), at(-2.4, 2.6 * side)]
-            looks += [(blade, 0, None, colour), (_closed(blade), 0.3, None, dark)]
-        looks.append(([at(-1.9)], 1.8, None, dark))
-        reach = 0.6 + 2.4 * tool.force / 120
-        for v in (-3.0, 0.0, 3.0):
-            head = [at(reach - 0.8, v + 0.7), at(reach, v), at(reach - 0.8, v - 0.7)]
-            looks += [
-                (points, 0.4, None, "#8fb9d8") for points in ([at(0.1, v), at(reach, v)], head)
-            ]
-        return looks
-    for k in range(-2, 3):  # a ring and its net
-        strings = [[at(2.3 * k, 4.2), at(1.3 * k + side, -4.6)] for side in (-1.2, 1.2)]
-        looks += [(string, 0.25, None, "#9c9ca8") for string in strings]
-    looks.append(([at(0)], 10.0, None, shade(GREEN, 1.5, 60)))
-    return [*looks, ([at(-5, 4.4), at(5, 4.4)], 1.1, None, colour)]
+def _look_box(tool, kind, colour, corners, at):  # cannon, fan, basket
+    dark = shade(colour, 0.62)
+    if tool.kind == "Cannon":  # a barrel on a wheel
+        yield corners, 0, kind.grey, None
+        yield [at(3.5)], 3.0, 255, None
+        for b, f, u, ink in ((3.2, 2.6, 4.6, dark), (2.7, 2.1, 4.2, colour)):
+            yield [at(-2.2)], 2 * b, None, ink
+            yield [at(-2.2, b), at(-2.2, -b), at(u, -f), at(u, f)], 0, None, ink
+        yield [at(-2.0, 1.5), at(3.6, 1.2)], 0.7, None, shade(colour, 1.35)
+        yield [at(3.9, 3.5), at(3.9, -3.5), at(5, -3.5), at(5, 3.5)], 0, None, shade(colour, 0.5)
+        yield [at(-2.2)], 3.0, None, "#4a3526"
+        yield [at(-2.2)], 2.3, None, "#6b4f3a"
+        return
+    yield corners, -1.0, kind.grey, None
+    if tool.kind == "Basket":  # a ring and its net
+        for k in range(-2, 3):
+            for side in (-1.2, 1.2):
+                yield [at(2.3 * k, 4.2), at(1.3 * k + side, -4.6)], 0.25, None, "#9c9ca8"
+        yield [at(0)], 10.0, None, shade(GREEN, 1.5, 60)
+        yield [at(-5, 4.4), at(5, 4.4)], 1.1, None, colour
+        return
+    yield [at(0), at(3.35)], 1.6, kind.grey, None  # where the fan blows to
+    yield corners, 0, None, shade(colour, 1.85, 150)
+    yield [at(-3.3, 1.1), at(-3.3, -1.1), at(-1.9, -0.8), at(-1.9, 0.8)], 0, None, dark
+    for v in (1, -1):
+        blade = [at(-1.9), at(-1.0, 1.6 * v), at(-1.5, 4.6 * v), at(-2.4, 2.6 * v)]
+        yield blade, 0, None, colour
+        yield blade, -0.3, None, dark
+    yield [at(-1.9)], 1.8, None, dark
+    reach = 0.6 + 2.4 * tool.force / 120  # its wind, longer for a stronger fan
+    for v in (-3.0, 0.0, 3.0):
+        yield [at(0.1, v), at(reach, v)], 0.4, None, "#8fb9d8"
+        head = [at(reach - 0.8, v + 0.7), at(reach, v), at(reach - 0.8, v - 0.7)]
+        yield head, 0.4, None, "#8fb9d8"
 
 
-def _look_vessel(tool, kind, corners, at):  # funnel, bucket; in grey the open side is missing
-    colour, size, half = kind.colour, tool.size, tool.size / math.sqrt(2)
-    looks = [(corners, 1.2, kind.grey, None), (corners, 0, None, colour)]
+def _look_vessel(tool, kind, colour, corners, at):  # funnel and bucket
+    size, half = tool.size, tool.size / math.sqrt(2)
+    yield corners, 1.2, kind.grey, None  # not closed: the open side is missing
     if tool.kind == "Funnel":  # a cone with a dark mouth and a nozzle
-        left, nozzle, right = corners
-        shine, dark = [nozzle, at(-0.55 * size, size / 2), at(-0.14 * size, size / 2)], 0.55
-        looks += [(_closed(corners), 0.5, None, shade(colour, 0.7))]
-        looks += [(shine, 0, None, shade(colour, 1.45)), ([nozzle], 1.6, None, shade(colour, dark))]
-        return [*looks, ([left, right], 1.0, None, shade(colour, dark))]
-    # a pail with two hoops, a shine, a bright rim at the opening, and a handle over it
+        yield corners, 0, None, colour
+        yield corners, -0.5, None, shade(colour, 0.7)
+        shine = [at(-0.55 * size, size / 2), at(-0.14 * size, size / 2), corners[1]]
+        yield shine, 0, None, shade(colour, 1.45)
+        yield corners[::2], 1.0, None, shade(colour, 0.55)
+        yield [corners[1]], 1.6, None, shade(colour, 0.55)
+        return
+    # a pail with a handle, a shine, two hoops and a bright rim at the opening
     handle = [(math.cos(k * math.pi / 8), 1 + 0.55 * math.sin(k * math.pi / 8)) for k in range(9)]
-    looks.insert(0, ([at(u * half, v * half) for u, v in handle], 0.35, None, "#8b8b94"))
+    yield [at(u * half, v * half) for u, v in handle], 0.35, None, "#8b8b94"
+    yield corners, 0, None, colour
+    yield corners, -0.4, None, shade(colour, 0.65)
     shine = [(-0.7, 0.8), (-0.7, -0.9), (-0.35, -0.9), (-0.35, 0.8)]
-    looks += [([at(u * half, v * half) for u, v in shine], 0, None, shade(colour, 1.25))]
-    edges = [_closed(corners), *([at(-half, v * half), at(half, v * half)] for v in (0.3, -0.55))]
-    looks += [(edge, 0.4, None, shade(colour, 0.65)) for edge in edges]
-    return [*looks, ([at(-half, half), at(half, half)], 1.0, None, shade(colour, 1.6))]
+    yield [at(u * half, v * half) for u, v in shine], 0, None, shade(colour, 1.25)
+    for v in (0.3 * half, -0.55 * half):
+        yield [at(-half, v), at(half, v)], 0.4, None, shade(colour, 0.65)
+    yield [at(-half, half), at(half, half)], 1.0, None, shade(colour, 1.6)
 
 
 LOOKS = {"disc": _look_round, "ball": _look_round, "polygon": _look_flat, "crate": _look_flat}
 LOOKS |= {"segment": _look_bar, "plank": _look_plank, "box": _look_box, "vessel": _look_vessel}
-
-
 FINE_GREY, FINE_COLOUR = 4, 3  # ours: drawn so many times too large and averaged: soft edges
 CAPTION = 6.0  # ours, units: room under the colour picture for a line of words
 
@@ -952,42 +921,46 @@ class Canvas:
         self.colour, self.fine = colour, FINE_COLOUR if colour else FINE_GREY
         self.scale = size * self.fine / WORLD  # fine pixels per unit
         height = size + colour * round(size * CAPTION / WORLD)
-        paper = ("RGB", PAPER) if colour else ("L", 255)  # the observation is white
-        self.image = Image.new(paper[0], (size * self.fine, height * self.fine), paper[1])
-        for k in range(1, 8):
-            v = k * WORLD / 8
-            lines = ([(v, 0), (v, WORLD)], [(0, v), (WORLD, v)])
-            self.draw([(points, 0.12, None, "#f1efe8") for points in lines])
+        mode, paper = ("RGB", PAPER) if colour else ("L", 255)  # the observation is on white
+        self.image = Image.new(mode, (size * self.fine, height * self.fine), paper)
+        for v in np.arange(1, 8) * WORLD / 8 if colour else ():
+            grid = ([(v, 0), (v, WORLD)], [(0, v), (WORLD, v)])
+            self.draw([(points, 0.12, None, "#f1efe8") for points in grid])
 
     def copy(self) -> "Canvas":
         other = copy.copy(self)
         other.image = self.image.copy()
         return other
 
-    def draw(self, strokes: list[Stroke]) -> None:
+    def draw(self, marks: Iterable[Stroke]) -> "Canvas":
         """Draw strokes, later ones over earlier ones."""
         pen = ImageDraw.Draw(self.image, "RGBA" if self.colour else "L")
-        for points, width, grey, colour in strokes:
+        for points, width, grey, colour in marks:
             ink = colour if self.colour else grey
             if ink is None:
                 continue
             # Pillow rounds to fine pixels: in the observation a ball moves in quarters of a unit.
             pixels = [(x * self.scale, (WORLD - y) * self.scale) for x, y in points]
-            wide = max(1, round(width * self.scale))
-            if not width:
+            pixels += pixels[:1] if width < 0 else []
+            wide = max(1, round(abs(width) * self.scale))
+            if width == 0:
                 pen.polygon(pixels, fill=ink)
             elif len(points) > 1:
                 pen.line(pixels, fill=ink, width=wide)
-            if width and wide > 2:
-                for x, y in pixels:
-                    left, top = round(x - wide / 2), round(y - wide / 2)
-                    pen.ellipse((left, top, left + wide - 1, top + wide - 1), fill=ink)
+            for x, y in pixels if width and wide > 2 else ():
+                left, top = round(x - wide / 2), round(y - wide / 2)
+                pen.ellipse((left, top, left + wide - 1, top + wide - 1), fill=ink)
+        return self
 
-    def text(self, x: float, words: str, colour: str, anchor: str) -> None:
-        """Words in the caption; `anchor` "lm" begins at x (units), "rm" ends there."""
-        font = ImageFont.load_default(size=3.1 * self.scale)
-        at = (x * self.scale, (WORLD + CAPTION / 2) * self.scale)
-        ImageDraw.Draw(self.image).text(at, words, fill=colour, font=font, anchor=anchor)
+    def write(self, left: str, right: str, colour: str) -> None:
+        """The caption: words at its left and right end."""
+        corners = [(0, 0), (WORLD, 0), (WORLD, -CAPTION), (0, -CAPTION)]
+        edge = ([(0, -0.1), (WORLD, -0.1)], 0.25, None, "#cfcdd6")
+        self.draw([(corners, 0, None, PAPER), edge])
+        font, pen = ImageFont.load_default(3.1 * self.scale), ImageDraw.Draw(self.image)
+        y = (WORLD + CAPTION / 2) * self.scale
+        pen.text((1.5 * self.scale, y), left, INK, font, "lm")
+        pen.text(((WORLD - 1.5) * self.scale, y), right, colour, font, "rm")
 
     def picture(self) -> np.ndarray:
         """uint8 (size, size) grey, or (height, size, 3) in colour."""
@@ -998,7 +971,7 @@ class Canvas:
 
 
 class Placement(enum.Enum):
-    """What came of the last action: `CreateEnv.placement`, and the words and colour of it."""
+    """What came of the last action (`CreateEnv.placement`): words and colour for the caption."""
 
     PLACED = ("placed", "#2a7f3f")
     NO_OP = ("waits", "#6a6772")
@@ -1026,15 +999,14 @@ class CreateEnv(gym.Env):
     | available | Box(0, NUM_ACTIONS-1, (K,), int64) | the tools on offer in this episode         |
 
     `available` is the no-op and K - 1 tools, drawn without replacement from the pool at every
-    reset; so it is for every pool, and N tools allow K up to N + 1. With K = N + 1 there is nothing
-    to draw: the no-op, then the pool in sorted order, so that positions keep their meaning.
+    reset. So it is for every pool: N tools allow K up to N + 1. With K = N + 1 there is nothing to
+    draw: the no-op, then the pool in sorted order, so that positions keep their meaning.
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a blocked placement or
     one outside the screen. In tasks with a marker ball, blue marker -> red target -> green goal
     (Figure 3): +1 (obstacle 2) for the target hit, the target's first move of 3.56 units (obstacle,
-    cannon: after the marker touched it). The goal counts only from then on; an earlier touch does
-    not.
+    cannon: after the marker touched it). The goal counts only from then on.
 
     ## Starting State
     The task's level with its random shifts; everything at rest.
@@ -1054,14 +1026,9 @@ class CreateEnv(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
 
     def __init__(
-        self,
-        action_pool: Sequence[int] | None = None,
-        num_available: int = NUM_AVAILABLE,
-        render_mode: str | None = None,
-        task: str = "push",
-        subgoal_reward: bool = True,
-        render_size: int = 420,
-    ):
+        self, action_pool=None, num_available=NUM_AVAILABLE, render_mode=None,
+        task="push", subgoal_reward=True, render_size=420,
+    ):  # fmt: skip
         if task not in TASKS:
             raise ValueError(f"unknown task {task!r}; allowed: {', '.join(TASKS)}")
         if render_mode not in (None, "rgb_array"):
@@ -1069,9 +1036,12 @@ class CreateEnv(gym.Env):
         ids = check_ids(split_actions()["train"] if action_pool is None else action_pool)
         self.action_pool = np.sort(ids[ids != NO_OP])
         check_ids([NO_OP, *self.action_pool], num_available)
-        self.num_available = num_available
-        self.task, self.render_mode, self.render_size = TASKS[task], render_mode, render_size
-        self.subgoal_reward = subgoal_reward
+        self.num_available, self.task, self.subgoal_reward = (
+            num_available,
+            TASKS[task],
+            subgoal_reward,
+        )
+        self.render_mode, self.render_size = render_mode, render_size
         self.observation_space = spaces.Dict(
             state=spaces.Box(0, 255, (NUM_FRAMES, 84, 84), np.uint8),
             available=spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
@@ -1079,25 +1049,24 @@ class CreateEnv(gym.Env):
         self.action_space = spaces.Dict(
             choice=spaces.Discrete(num_available), position=spaces.Box(-1, 1, (2,), np.float32)
         )
-        self._over = True  # no episode yet
-        self._pictures: list[np.ndarray] = []
+        self._over, self._pictures = True, []  # no episode yet
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start an episode with a new set of tools; returns (observation, {})."""
         super().reset(seed=None if seed is None else operator.index(seed))  # numpy integers, too
-        # published code: the Full split's test draws a class, then a tool of it; we: as in
+        # published code: the Full Split's test draws a class, then a tool of it; we: as in
         # training, because the appendix names no other way
         drawn, k = self.action_pool, self.num_available - 1
         if k < len(drawn):
             drawn = self.np_random.choice(drawn, k, replace=False)
         self.available = np.concatenate([[NO_OP], drawn])  # (K,)
         self._build_level()
-        self._centres: list[tuple[float, float]] = []  # norm, of the tools placed so far
+        self._centres: list[list[float]] = []  # norm, of the tools placed so far
         self._goal_hit, self._target_hit = False, self._marker is None
         self._still, self._actions, self._over = 0, 0, False
-        self._tool, self._position, self.placement = TOOLS[NO_OP], (0.0, 0.0), Placement.NO_OP
+        self._tool, self._position, self.placement = TOOLS[NO_OP], [0.0, 0.0], Placement.NO_OP
         self._frames = np.zeros((NUM_FRAMES, 84, 84), np.uint8)
-        self._trails = [(ball, []) for ball in (self._target, self._marker) if ball is not None]
+        self._trails = [(ball, []) for ball in (self._target, self._marker) if ball]
         self._pictures = [self._draw()] if self.render_mode else []
         return self._observe(), {}
 
@@ -1120,12 +1089,11 @@ class CreateEnv(gym.Env):
             add(BOUNDARY[side])
         self._target = add(task.target)
         self._goal = add(task.goal, -1 if task.goal_on_either_side and rng.random() < 0.5 else 1)
-        self._goal.wants = self._target
+        self._goal.wants, self._start = self._target, self._target.pose()[:2]
         if self._marker:
             self._marker.wants = self._target
         for subgoal in self._subgoals:
             subgoal.wants = self._marker or self._target
-        self._start = self._target.pose()
         self._repaint()
 
     def _add(self, thing: Thing) -> Thing:
@@ -1140,24 +1108,24 @@ class CreateEnv(gym.Env):
         gymnasium's ResetNeeded after the end of an episode.
         """
         choice, position = action["choice"], np.asarray(action["position"], np.float64)
-        if position.shape != (2,) or not np.isfinite(position).all():
-            raise ValueError(f"position must be two finite numbers, got {action['position']!r}")
-        if not 0 <= choice < self.num_available:
+        if not self.action_space["choice"].contains(choice):
             raise ValueError(f"choice must be 0..{self.num_available - 1}, got {choice!r}")
+        if position.shape != (2,) or not np.isfinite(position).all():
+            raise ValueError(f"position must be two finite numbers, got {position}")
         if self._over:
             raise gym.error.ResetNeeded("the episode is over (or none began): call reset()")
         self._tool, self._position = TOOLS[self.available[choice]], position.tolist()
         self.placement, self._pictures = self._place(), []
         for substep in range(SUBSTEPS):
-            if self.render_mode and substep and substep % 8 == 0:
+            if self.render_mode and substep and substep % PICTURE_EVERY == 0:
                 self._pictures.append(self._draw())
             self._space.step(DT)
         self._actions += 1
         reward = self._reward(*self._settle())
         terminated, truncated = self._ended()
+        self._over = terminated or truncated
         if self.render_mode:
             self._pictures.append(self._draw())
-        self._over = terminated or truncated
         info = {METRIC: float(self._goal_hit)} if self._over else {}
         return self._observe(), reward, terminated, truncated, info
 
@@ -1165,38 +1133,37 @@ class CreateEnv(gym.Env):
         """Put the chosen tool at its position if it may stand there."""
         if self._tool.kind == "No-op":
             return Placement.NO_OP
-        x, y = self._position
-        # appendix: "invalid penalty for placing outside the scene"; published code: clips the
-        # position first, so its penalty never fires; we do not clip, because the appendix pays it
-        if max(abs(x), abs(y)) > 1.0:
+        # appendix: a penalty "for placing outside the scene"; published code: clips the position
+        # first, so its penalty never fires; we do not clip, because the appendix has it
+        if max(map(abs, self._position)) > 1.0:
             return Placement.OUTSIDE
         # appendix: "overlap over existing objects"; published code: this distance to earlier tools,
         # or contact of the exact shapes with anything in the scene. As published.
-        if any(math.dist((x, y), centre) <= MIN_TOOL_GAP for centre in self._centres):
+        if any(math.dist(self._position, centre) <= MIN_TOOL_GAP for centre in self._centres):
             return Placement.NEAR_TOOL
-        thing = build(self._tool, to_units(x), to_units(y), self._space.static_body)
+        thing = build(self._tool, *map(to_units, self._position), self._space.static_body)
         if self._space.shape_query(thing.shape):  # sensors count
             return Placement.ON_SHAPE
-        self._centres.append((x, y))
-        self._paint(self._add(thing))
+        self._centres.append(self._position)
+        self._paint([self._add(thing)])
         return Placement.PLACED
 
     def _settle(self) -> tuple[bool, int, bool]:
         """Who touched what: (goal reached, subgoals reached, target first moved) in this step."""
         moved = False
         if not self._target_hit:
-            # The screen's diagonal is the unit; who has left the screen stands at its edge.
-            places = np.clip((self._target.pose()[:2], self._start[:2]), 0, WORLD)
-            far = math.dist(*places) / (WORLD * math.sqrt(2)) > HIT_DISTANCE
+            # in shares of the screen's diagonal; who has left the screen counts at its edge
+            ways = np.clip((self._target.pose()[:2], self._start), 0, WORLD)
+            far = math.dist(*ways) > HIT_DISTANCE * WORLD * math.sqrt(2)
             moved = far and (self._marker.touched or not self.task.marker_must_hit)
             self._target_hit = moved
-        # published code: tests the goal before the target hit, and never forgets a touch, so a goal
-        # touched too soon counts at the hit, wherever the target is then. We: a touch in the action
-        # of the hit counts, an earlier one does not, because the ball has to come to the goal.
-        self._goal.touched &= self._target_hit
-        self._goal_hit = self._goal.touched
+        # published code: tests the goal before the target hit and never forgets a touch, so a goal
+        # touched too soon counts at the hit, wherever the target is by then. We: a touch in the
+        # action of the hit counts, an earlier one does not, because the target has to come to rest
+        # with the goal, not to have passed it.
+        self._goal.touched = self._goal_hit = self._target_hit and self._goal.touched
         # published code: a subgoal counts if touched at the end of an action; we: at any time in
-        # it, by the rule of the goal
+        # it, because that is the rule of the goal
         reached = [subgoal for subgoal in self._subgoals if subgoal.touched]
         for subgoal in reached:
             self._space.remove(*subgoal.parts)
@@ -1217,8 +1184,7 @@ class CreateEnv(gym.Env):
         # C.3 names subgoals; push has none and was run without them all the same, so the reward for
         # the target hit must have been meant too.
         if self.subgoal_reward:
-            reward += subgoals * LAMBDA_SUBGOAL
-            reward += target_moved * self.task.target_hit_reward
+            reward += subgoals * LAMBDA_SUBGOAL + target_moved * self.task.target_hit_reward
         return reward
 
     def _ended(self) -> tuple[bool, bool]:
@@ -1236,30 +1202,26 @@ class CreateEnv(gym.Env):
         return terminated, not terminated and self._actions >= self.task.max_actions
 
     def _repaint(self) -> None:
-        """The pictures of everything that stands still; what moves is drawn on copies of them."""
+        """Pictures of all that stands still; what moves is drawn on copies of them."""
         self._canvases = [Canvas(84)]
         if self.render_mode:
             self._canvases.append(Canvas(self.render_size, colour=True))
-        for thing in self._things:
-            self._paint(thing)
+        self._paint(self._things)
 
-    def _paint(self, thing: Thing) -> None:
-        if thing.body is None:
-            for canvas in self._canvases:
+    def _paint(self, things: Sequence[Thing]) -> None:
+        for thing in things:
+            for canvas in self._canvases if thing.body is None else ():
                 canvas.draw(strokes(thing.tool, thing.pose()))
 
-    def _scene(self, canvas: Canvas) -> Canvas:
-        """A copy of one of the two pictures, with all that moves on top."""
+    def _moving(self) -> Iterable[Stroke]:
         # published code: target and goal first, tools, level objects last; we: what stands still
-        # first, because that can be kept from step to step
-        canvas = canvas.copy()
+        # first, because it can be kept from step to step
         for thing in self._things:
-            if thing.body is not None:
-                canvas.draw(strokes(thing.tool, thing.pose()))
-        return canvas
+            if thing.body:
+                yield from strokes(thing.tool, thing.pose())
 
     def _observe(self) -> dict[str, np.ndarray]:
-        picture = self._scene(self._canvases[0]).picture()[None]  # (1, 84, 84)
+        picture = self._canvases[0].copy().draw(self._moving()).picture()[None]  # (1, 84, 84)
         self._frames = np.concatenate([self._frames[1:], picture])  # (3, 84, 84), a fresh array
         return {"state": self._frames.copy(), "available": self.available.copy()}
 
@@ -1271,24 +1233,19 @@ class CreateEnv(gym.Env):
             for k, point in enumerate(trail[-90:]):
                 alpha = 40 + 150 * k // min(len(trail), 90)
                 canvas.draw([([point], 1.1, None, shade(ball.kind.colour, 1.1, alpha))])
-        canvas = self._scene(canvas)
+        canvas.draw(self._moving())
         words, colour = self.placement.value if self._actions else ("", INK)
-        if colour == Placement.OUTSIDE.value[1]:  # a red cross where the tool may not stand
-            x, y = (min(max(to_units(value), 2.0), WORLD - 2.0) for value in self._position)
+        if self.placement not in (Placement.PLACED, Placement.NO_OP):  # a cross where it may not be
+            x, y = np.clip([to_units(value) for value in self._position], 2, WORLD - 2)
             for v in (-1.6, 1.6):
                 canvas.draw([([(x - 1.6, y - v), (x + 1.6, y + v)], 0.8, None, colour)])
         if self._goal_hit:
-            words, colour = "goal!", "#2a7f3f"
-            at, turns = frame(*self._goal.pose()), [k / 18 * math.pi for k in range(37)]
+            words, colour, at = "goal!", "#2a7f3f", frame(*self._goal.pose())
+            turns = [k / 18 * math.pi for k in range(37)]
             ring = [at(7.1 * math.cos(turn), 7.1 * math.sin(turn)) for turn in turns]
             canvas.draw([(ring, 0.8, None, GREEN)])
-        corners = [(0, 0), (WORLD, 0), (WORLD, -CAPTION), (0, -CAPTION)]
-        canvas.draw(
-            [(corners, 0, None, PAPER), ([(0, -0.1), (WORLD, -0.1)], 0.25, None, "#cfcdd6")]
-        )
         name = self._tool.kind if self._actions else ""
-        canvas.text(1.5, f"{self._actions}/{self.task.max_actions}  {name}", INK, "lm")
-        canvas.text(WORLD - 1.5, words, colour, "rm")
+        canvas.write(f"{self._actions}/{self.task.max_actions}  {name}", words, colour)
         return canvas.picture()
 
     def render(self) -> np.ndarray | None:
@@ -1296,9 +1253,9 @@ class CreateEnv(gym.Env):
         return self.render_frames()[-1] if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step, one every 8 physics steps: 5, or 1 right after a reset.
+        """Pictures of the last step: 5, or 1 right after a reset, or none without render_mode.
 
-        None at all without render_mode. Raises gymnasium's ResetNeeded before the first reset.
+        Raises gymnasium's ResetNeeded before the first reset.
         """
         if self.render_mode and not self._pictures:
             raise gym.error.ResetNeeded("call reset() before the first picture")
@@ -1307,21 +1264,12 @@ class CreateEnv(gym.Env):
 
 gym.register("ActionGen/Create-v0", entry_point=f"{__name__}:CreateEnv")
 for _task in TASKS:  # ActionGen/Create-Push-v0 and so on
-    _name = f"ActionGen/Create-{_task.capitalize()}-v0"
-    gym.register(_name, entry_point=f"{__name__}:CreateEnv", kwargs={"task": _task})
+    _id = f"ActionGen/Create-{_task.capitalize()}-v0"
+    gym.register(_id, entry_point=f"{__name__}:CreateEnv", kwargs={"task": _task})
 
 
-def make_vec(
-    num_envs: int,
-    action_pool: Sequence[int] | None = None,
-    num_available: int = NUM_AVAILABLE,
-    seed: int = 0,
-    **options,
-) -> gym.vector.VectorEnv:
-    """`num_envs` environments with independent streams; `options` go to `CreateEnv`.
-
-    An environment that ends is reset in the same step (SAME_STEP). ValueErrors as `CreateEnv`.
-    """
+def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **options):
+    """SyncVectorEnv of `num_envs` independent streams; `options`, ValueErrors as `CreateEnv`."""
     one = functools.partial(CreateEnv, action_pool, num_available, **options)
     envs = gym.vector.SyncVectorEnv([one] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
     # seed + i would let neighbouring seeds share environments; a SeedSequence's words do not.
@@ -1337,31 +1285,23 @@ PROBE_EVERY = 10  # published code: a state is recorded after steps 10, 20, ...,
 PROBE_LENGTH = 7  # A.3 "ball trajectories of length 7", cut out of the 9 recorded states
 PROBE_SPEED = 12.5  # published code, units/s
 PROBE_AREA = 0.7  # published code, norm: the tool stands in [-0.7, 0.7]^2
-# appendix: 48x48 in A.3 and D.3.1, 84x84 in B; published code: 48x48. As A.3, the smaller network.
-PROBE_VIDEO = 48
+PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; published code: 48x48. As A.3.
 PROBE_BALL = Tool("Marker", 1.0, size=BALL_RADIUS, mass=BALL_MASS)
 CELL = 1_000.0  # ours, units: trajectories run side by side in one space, too far apart to meet
 
 
-def action_observations(
-    action_ids: Sequence[int],
-    num_observations: int,
-    modality: str = "xy",
-    seed: int = 0,
-    workers: int = 1,
-) -> np.ndarray:
-    """Trajectories of a probe ball launched at each tool (A.3 action observations, section B).
+def action_observations(action_ids, num_observations, modality="xy", seed=0, workers=1):
+    """Trajectories of a probe ball launched at each tool, an array (A.3 action observations, B).
 
     | modality | result                                                                           |
     |----------|----------------------------------------------------------------------------------|
     | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm; the paper's default)               |
     | "state"  | float32 (len(ids), n, 7, 6): tool x, y, ball x, y (norm), ball velocity (norm/s) |
-    | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same trajectories           |
+    | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same scenes                 |
 
     n = `num_observations` (paper: 1,024). Frames are 1/3 s apart; the contact is near the middle.
     The bytes for one tool depend on (seed, tool, n) only, not on `workers` or the other ids.
-    "video" needs 16 MB per tool at n = 1,024. Raises ValueError for bad ids, an unknown modality, or
-    n below 1.
+    "video" needs 16 MB per tool at n = 1,024. Raises ValueError for bad ids, modality or n.
     """
     ids, shapes = check_ids(action_ids), {"xy": (2,), "state": (6,), "video": (PROBE_VIDEO,) * 2}
     if modality not in shapes or num_observations < 1:
@@ -1388,6 +1328,7 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
     result = np.zeros((n, PROBE_LENGTH, 7), np.float32)
     waiting, attempt = np.arange(n), 0
     while len(waiting):
+        last = attempt >= PROBE_ATTEMPTS - 1  # then a miss is kept, an overlap draws again
         start = rng.uniform(-1.0, 1.0, (len(waiting), 2))
         gap = places[waiting] - start  # the ball flies at the tool's centre
         distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (waiting, 1) norm
@@ -1397,7 +1338,6 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
         velocity = speed * gap / np.maximum(distance, 1e-9)
         states, contact = _launch(tool, places[waiting], start, velocity)
         # contact: physics step 1..90 of the first touch, 0 overlap at launch, 91 never
-        last = attempt >= PROBE_ATTEMPTS - 1  # then a miss is kept, an overlap draws again
         done = (contact > 0) & ((contact <= PROBE_STEPS) | last)
         first = (contact[done] - 1) // PROBE_EVERY  # the first state at or after the touch
         cut = np.where(contact[done] > PROBE_STEPS, 1, np.clip(first - 3, 0, 2))
@@ -1416,16 +1356,13 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
     numbers and a plank's angle (rad), and the step of the first contact (m,): 0 overlap at launch,
     91 never.
     """
-    m = len(places)
-    space, met = make_space(), []
-    space.on_collision(
-        Contact.MOVING, None, begin=lambda arbiter, *_: met.append(arbiter.shapes[0].thing)
-    )
-    side = math.ceil(math.sqrt(m))
-    offsets = CELL * np.stack(np.divmod(np.arange(m), side), axis=1)  # (m, 2) units
+    m, space, met = len(places), make_space(), []
+    note = lambda arbiter, *_: met.append(arbiter.shapes[0].thing)
+    space.on_collision(Contact.MOVING, None, begin=note)
+    offsets = CELL * np.stack(np.divmod(np.arange(m), math.ceil(math.sqrt(m))), axis=1)  # (m, 2)
     tools = [build(tool, *at, space.static_body) for at in (to_units(places) + offsets).tolist()]
-    space.add(*(part for thing in tools for part in thing.parts))
     balls = [build(PROBE_BALL, *at, None) for at in (to_units(start) + offsets).tolist()]
+    space.add(*(part for thing in tools for part in thing.parts))
     overlap = [bool(space.shape_query(ball.shape)) for ball in balls]
     for ball, speed in zip(balls, velocity.tolist(), strict=True):
         ball.body.velocity = tuple(speed)
@@ -1438,29 +1375,27 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
         while met:
             first.setdefault(met.pop(), step)
         if step % PROBE_EVERY == 0:
-            frame = recorded[:, step // PROBE_EVERY - 1]  # (m, 7)
-            frame[:, 2:4] = ([ball.body.position for ball in balls] - offsets) * 2 / WORLD - 1
+            now = recorded[:, step // PROBE_EVERY - 1]  # (m, 7)
+            now[:, 2:4] = ([ball.body.position for ball in balls] - offsets) * 2 / WORLD - 1
             # published code: velocities through the map of positions (v/42 - 1, a slip); we: v/42
-            frame[:, 4:6] = np.array([ball.body.velocity for ball in balls]) * 2 / WORLD
-            frame[:, 6] = [thing.pose()[2] for thing in tools]
+            now[:, 4:6] = np.array([ball.body.velocity for ball in balls]) * 2 / WORLD
+            now[:, 6] = [thing.pose()[2] for thing in tools]
     contact = [first.get(ball, PROBE_STEPS + 1) for ball in balls]
     return recorded, np.where(overlap, 0, contact)
 
 
 def _film(tool: Tool, states: np.ndarray) -> np.ndarray:
-    """Pictures of one tool's trajectories, uint8 (n, 7, 48, 48), from its states (n, 7, 7).
+    """One tool's trajectories (n, 7, 7) as pictures, uint8 (n, 7, 48, 48).
 
     "Collected identically as the state case, only the modality changes" (B): the whole scene, with
     the tool where it stands.
     """
-    video = np.empty((*states.shape[:2], PROBE_VIDEO, PROBE_VIDEO), np.uint8)
-    blank = Canvas(PROBE_VIDEO)
-    for trajectory, pictures in zip(states.astype(np.float64), video, strict=True):
-        for state, picture in zip(trajectory, pictures, strict=True):
-            canvas, (x, y, u, v) = blank.copy(), to_units(state[:4]).tolist()
-            canvas.draw(strokes(tool, (x, y, state[6])))
-            canvas.draw(strokes(PROBE_BALL, (u, v, 0.0)))
-            picture[:] = canvas.picture()
+    blank, video = Canvas(PROBE_VIDEO), np.empty((*states.shape[:2], 48, 48), np.uint8)
+    for frame_at in np.ndindex(states.shape[:2]):
+        *places, _, _, angle = states[frame_at].tolist()
+        x, y, u, v = map(to_units, places)
+        scene = strokes(tool, (x, y, angle)) + strokes(PROBE_BALL, (u, v, 0.0))
+        video[frame_at] = blank.copy().draw(scene).picture()
     return video
 
 
@@ -1482,27 +1417,25 @@ def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None
 
 def beside(picture: np.ndarray, state: np.ndarray) -> np.ndarray:
     """A colour picture, and beside it the grey ones the policy sees, the newest at the bottom."""
-    height, width = picture.shape[:2]
-    eye = Image.fromarray(state.reshape(-1, 84)).resize((width // 3, width), Image.NEAREST)
+    height, width, _ = picture.shape
     page = Image.new("RGB", (width + 6 + width // 3, height), PAPER)
     page.paste(Image.fromarray(picture), (0, 0))
-    page.paste(eye, (width + 6, 0))
+    page.paste(Image.fromarray(state.reshape(-1, 84)).resize((width // 3, width)), (width + 6, 0))
     return np.array(page)
 
 
 def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, int]:
     """A random episode: (frames, return, length). A tool is tried on half the steps."""
     rng, total, length, over = np.random.default_rng(seed), 0.0, 0, False
-    observation, _ = env.reset(seed=seed)
-    frames = [beside(picture, observation["state"]) for picture in env.render_frames()]
+    state = env.reset(seed=seed)[0]["state"]
+    frames = [beside(picture, state) for picture in env.render_frames()]
     while not over:
         choice = int(rng.integers(env.num_available)) if rng.random() < 0.5 else NO_OP
         action = {"choice": choice, "position": rng.uniform(-0.9, 0.9, 2)}
-        before = observation["state"]
         observation, reward, terminated, truncated, _ = env.step(action)
-        pictures, total, length = env.render_frames(), total + reward, length + 1
-        frames += [beside(picture, before) for picture in pictures[:-1]]
-        frames += [beside(picture, observation["state"]) for picture in pictures[-1:]]
+        # beside what happens stands what was seen when the tool was chosen
+        frames += [beside(picture, state) for picture in env.render_frames()]
+        state, total, length = observation["state"], total + reward, length + 1
         over = terminated or truncated
     return frames, total, length
 
@@ -1513,59 +1446,58 @@ def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> I
     rows = math.ceil(len(tiles) / columns)
     shape = (columns * (size + gap) + gap, rows * (size + bar + gap) + gap)
     page, font = Image.new("RGB", shape, "white"), ImageFont.load_default(size=17)
-    draw = ImageDraw.Draw(page)
+    pen = ImageDraw.Draw(page)
     for k, (tile, title) in enumerate(zip(tiles, titles, strict=True)):
         x, y = gap + k % columns * (size + gap), gap + k // columns * (size + bar + gap)
         page.paste(Image.fromarray(tile[:size]), (x, y))  # without its caption
-        draw.rectangle((x, y, x + size - 1, y + size - 1), outline="#b8b6c0")
-        draw.text((x + size / 2, y + size + bar / 2 + 1), title, fill=INK, font=font, anchor="mm")
+        pen.rectangle((x, y, x + size - 1, y + size - 1), outline="#b8b6c0")
+        pen.text((x + size / 2, y + size + bar / 2 + 1), title, INK, font, "mm")
     return page
 
 
-def tasks_sheet(size: int = 300) -> Image.Image:
+def tasks_sheet() -> Image.Image:
     """Figure 7: the 12 tasks as they start."""
-    tiles = []
-    for task in TASKS:
-        env = CreateEnv(task=task, render_mode="rgb_array", render_size=size)
+    envs = [CreateEnv(task=task, render_mode="rgb_array", render_size=300) for task in TASKS]
+    for env in envs:
         env.reset(seed=0)
-        tiles.append(env.render())
-    return sheet(tiles, [f"({'abcdefghijkl'[k]}) {task}" for k, task in enumerate(TASKS)], 4)
+    titles = [f"({chr(97 + k)}) {task}" for k, task in enumerate(TASKS)]
+    return sheet([env.render() for env in envs], titles, 4)
 
 
-def portrait(tools: Sequence[Tool], size: int) -> np.ndarray:
-    """One tool, or four, uint8 (size, size, 3): the middle of the world, enlarged."""
-    canvas, spots = Canvas(2 * size, colour=True), [(42, 42)]
-    if len(tools) > 1:
-        spots = [(x, y) for y in (53, 31) for x in (31, 53)]
+def portrait(tools: Sequence[Tool], spots: Sequence[tuple], size: int) -> np.ndarray:
+    """Tools at their spots (units), uint8 (size, size, 3): the middle 60 x 60 units of the world."""
+    canvas, edge = Canvas(round(1.4 * size), colour=True), round(0.2 * size)
     for tool, (x, y) in zip(tools, spots, strict=True):
         canvas.draw(strokes(tool, (x, y, 0.0)))
-    return canvas.picture()[size // 2 : -size // 2, size // 2 : -size // 2]
+    return canvas.picture()[edge : edge + size, edge : edge + size]
 
 
-def tools_sheet(size: int = 300) -> Image.Image:
+def tools_sheet() -> Image.Image:
     """Four tools of each class, and how many there are 15 degrees apart."""
-    labels, tiles, titles = action_labels(), [], []
+    labels, spots = action_labels()[IS_COARSE], [(27, 57), (57, 57), (27, 27), (57, 27)]
+    tiles, titles = [], []
     for label in dict.fromkeys(labels[1:].tolist()):
-        ids = np.flatnonzero((labels == label) & (DEGREES % COARSE == 0))
-        four = [TOOLS[ids[int(share * len(ids))]] for share in (0.45, 0.7, 0.98, 0.12)]
-        tiles.append(portrait(four, size))
-        titles.append(f"{label} ({len(ids)})")
+        members = [tool for tool, its in zip(np.flatnonzero(IS_COARSE), labels) if its == label]
+        four = [TOOLS[members[int(share * len(members))]] for share in (0.98, 0.12, 0.45, 0.7)]
+        tiles.append(portrait(four, spots, 300))
+        titles.append(f"{label} ({len(members)})")
     return sheet(tiles, titles, 5)
 
 
-def probe_sheet(name: str, size: int = 420, trajectories: int = 40) -> Image.Image:
-    """Probe-ball trajectories over one tool, moved so that the tool stands in the middle."""
+def probe_sheet(name: str) -> Image.Image:
+    """Probe-ball trajectories over tools, moved so that the tool stands in the middle."""
     labels = action_labels()
-    ids = np.flatnonzero((np.char.lower(labels) == name.lower()) & (DEGREES % COARSE == 0))
-    ids = [int(name)] if name.isdecimal() else [*map(int, ids[[len(ids) // 9, len(ids) // 2, -9]])]
+    members = np.flatnonzero((np.char.lower(labels) == name.lower()) & IS_COARSE)
+    if not (name.isdecimal() or len(members)):
+        raise ValueError(
+            f"unknown tool {name!r}: an id, or one of {', '.join(sorted(set(labels)))}"
+        )
+    ids = [int(name)] if name.isdecimal() else members[[len(members) * k // 10 for k in (1, 5, 9)]]
     tiles = []
-    for action in ids:
-        states = action_observations([action], trajectories, "state")[0]
-        canvas = Canvas(size, colour=True)
+    for states, action in zip(action_observations(ids, 40, "state"), ids, strict=True):
+        canvas = Canvas(420, colour=True)
         for k, path in enumerate(to_units(states[..., 2:4] - states[..., :2]).tolist()):
-            hue = tuple(
-                int(255 * value) for value in colorsys.hsv_to_rgb(k / trajectories, 0.6, 0.85)
-            )
+            hue = tuple(int(255 * share) for share in colorsys.hsv_to_rgb(k / 40, 0.6, 0.85))
             dots = [([point], 0.7 + 0.22 * age, None, hue) for age, point in enumerate(path)]
             canvas.draw([(path, 0.3, None, (*hue, 150)), *dots])
         canvas.draw(strokes(TOOLS[action], (WORLD / 2, WORLD / 2, 0.0)))
@@ -1574,60 +1506,54 @@ def probe_sheet(name: str, size: int = 420, trajectories: int = 40) -> Image.Ima
 
 
 def play(env: CreateEnv, seed: int = 0) -> None:
-    """A window to play in: click on a tool, click on the scene to place it, space to wait.
-
-    The arrow keys choose, too. To the right is what the policy sees, the newest picture at the
-    bottom. An episode that ends gives way to the next one.
+    """A window to play in: click on a tool (or arrow keys), click on the scene to place it, space
+    to wait. To the right is what the policy sees, the newest picture at the bottom.
     """
     import matplotlib.pyplot as plt  # here, so that no other command needs a display
 
+    columns, chosen, total, said = 5, 0, 0.0, ""
     observation, _ = env.reset(seed=seed)
-    columns, now = 5, {"tool": min(1, env.num_available - 1), "total": 0.0, "title": ""}
-    figure, (strip, scene, eye) = plt.subplots(1, 3, figsize=(13, 6), width_ratios=(2, 4, 1.4))
+    figure, panels = plt.subplots(1, 3, figsize=(13, 6), width_ratios=(2, 4, 1.4))
 
     def show() -> None:
-        tiles = [portrait([TOOLS[action]], 60) for action in env.available]
-        tiles[now["tool"]][:4] = tiles[now["tool"]][-4:] = 0  # the chosen one
+        tiles = [portrait([TOOLS[action]], [(42, 42)], 70) for action in env.available]
+        tiles[chosen] = tiles[chosen] // 4 * 3  # in the shade
         tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
-        rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
-        pictures = (np.vstack(rows), (0, columns, len(rows), 0)), (env.render(), (0, 84, -6, 84))
-        pictures += ((np.vstack(observation["state"]), None),)
-        for axes, (picture, extent) in zip((strip, scene, eye), pictures, strict=True):
+        strip = np.vstack(
+            [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
+        )
+        extents = (0, columns, len(tiles) // columns, 0), (0, WORLD, -CAPTION, WORLD), None
+        pictures = strip, env.render(), np.vstack(observation["state"])
+        titles = TOOLS[env.available[chosen]].kind, f"return {total:.2f} {said}", "the policy sees"
+        for axes, picture, extent, title in zip(panels, pictures, extents, titles, strict=True):
             axes.clear()
-            axes.axis("off")
-            axes.imshow(picture, cmap="gray", extent=extent)
-        strip.set_title(TOOLS[env.available[now["tool"]]].kind)
-        scene.set_title(f"return {now['total']:.2f}  {now['title']}")
+            axes.set_axis_off()
+            axes.set_title(title)
+            axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent)
         figure.canvas.draw_idle()
 
-    def act(choice: int, x: float = 0.0, y: float = 0.0) -> None:
-        nonlocal observation
-        action = {"choice": choice, "position": (x, y)}
-        observation, reward, terminated, truncated, info = env.step(action)
-        now["total"], now["title"] = now["total"] + reward, env.placement.value[0]
-        if terminated or truncated:
-            now["title"] = "the goal is reached" if info[METRIC] else "the episode is over"
-            observation, now["total"] = env.reset()[0], 0.0
+    def on_event(event) -> None:
+        nonlocal observation, chosen, total, said
+        key, place, action = getattr(event, "key", None), event.inaxes, None
+        ways = {"left": -1, "right": 1, "up": -columns, "down": columns}
+        if event.name == "key_press_event":
+            chosen = (chosen + ways.get(key, 0)) % env.num_available
+            action = {"choice": NO_OP, "position": (0, 0)} if key == " " else None
+        elif place is panels[0]:
+            chosen = min(int(event.ydata) * columns + int(event.xdata), env.num_available - 1)
+        elif place is panels[1]:
+            position = (event.xdata * 2 / WORLD - 1, event.ydata * 2 / WORLD - 1)
+            action = {"choice": chosen, "position": position}
+        if action:
+            observation, reward, terminated, truncated, info = env.step(action)
+            total, said = total + reward, ""
+            if terminated or truncated:
+                said = f"at the end, {'goal' if info[METRIC] else 'no goal'}; the next episode:"
+                observation, total = env.reset()[0], 0.0
         show()
 
-    def on_click(event) -> None:
-        if event.inaxes is scene and event.ydata > 0:
-            act(now["tool"], event.xdata * 2 / WORLD - 1, event.ydata * 2 / WORLD - 1)
-        elif event.inaxes is strip:
-            spot = int(event.ydata) * columns + int(event.xdata)
-            now["tool"] = min(spot, env.num_available - 1)
-            show()
-
-    def on_key(event) -> None:
-        steps = {"left": -1, "right": 1, "up": -columns, "down": columns}
-        if event.key == " ":
-            act(NO_OP)
-        elif event.key in steps:
-            now["tool"] = (now["tool"] + steps[event.key]) % env.num_available
-            show()
-
-    figure.canvas.mpl_connect("button_press_event", on_click)
-    figure.canvas.mpl_connect("key_press_event", on_key)
+    for event in ("button_press_event", "key_press_event"):
+        figure.canvas.mpl_connect(event, on_event)
     show()
     plt.show()
 
@@ -1645,37 +1571,33 @@ class Args:
     play: bool = False  # open a window and place the tools yourself
     all_tasks: bool = False  # draw the 12 tasks on one sheet (Figure 7)
     show_tools: bool = False  # draw tools of every class
-    show_probe: str | None = None  # draw probe-ball trajectories over a tool (class name or id)
+    show_probe: str = ""  # draw probe-ball trajectories over a tool (class name or id)
     out: Path = Path("runs/demo")  # folder for the pictures
 
 
 def main(args: Args) -> None:
     """Draw what was asked for and say where it is."""
-    args.out.mkdir(parents=True, exist_ok=True)
+    env = CreateEnv(task=args.task, render_mode="rgb_array")
     if args.play:
-        return play(CreateEnv(task=args.task, render_mode="rgb_array"), args.seed)
+        return play(env, args.seed)
+    args.out.mkdir(parents=True, exist_ok=True)
     sheets = {"tasks": tasks_sheet} if args.all_tasks else {}
     sheets |= {"tools": tools_sheet} if args.show_tools else {}
-    sheets |= {"probe": lambda: probe_sheet(args.show_probe)} if args.show_probe else {}
+    sheets |= {"probe": functools.partial(probe_sheet, args.show_probe)} if args.show_probe else {}
     for name, draw in sheets.items():
         draw().save(args.out / f"create_{name}.png")
         print(f"wrote {args.out / f'create_{name}.png'}")
-    if sheets:
-        return None
-    env = CreateEnv(task=args.task)
-    best = max(range(args.seed, args.seed + args.tries), key=lambda s: play_episode(env, s)[1])
-    env = CreateEnv(task=args.task, render_mode="rgb_array")
-    frames, total, length = play_episode(env, best)
-    path = args.out / f"create_{args.task}.gif"
-    save_gif(path, frames + frames[-1:] * 20, env.metadata["render_fps"])  # time to see the end
-    print(
-        f"best of {args.tries} random episodes of {args.task}: seed {best}, {length} actions, ",
-        end="",
-    )
-    print(f"return {total:.2f}; wrote {path}")
+    if not sheets:
+        seeds, blind = range(args.seed, args.seed + args.tries), CreateEnv(task=args.task)
+        best = max(seeds, key=lambda seed: play_episode(blind, seed)[1])
+        frames, total, length = play_episode(env, best)
+        path = args.out / f"create_{args.task}.gif"
+        save_gif(path, frames + frames[-1:] * 20, env.metadata["render_fps"])  # time to see the end
+        print(f"best of {args.tries} random episodes of {args.task}: seed {best}, {length} actions, "
+              f"return {total:.2f}; wrote {path}")  # fmt: skip
     for split in ("default", "full", "analysis"):
         sizes = ", ".join(f"{part} {len(ids):,}" for part, ids in split_actions(split).items())
-        print(f"  split {split:9} {sizes}")
+        print(f"split {split:9} {sizes}")
 
 
 if __name__ == "__main__":
