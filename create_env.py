@@ -403,14 +403,12 @@ TASKS: dict[str, Task] = {
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8, "marker"),
         target=ball("Target", 0.1, -0.47, "target"), goal=star(-0.9, -0.69),
-        items=(
-            line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
-            line(-0.8, -0.81, 16), line(0.12, -0.59, 16), line(-0.34, -0.70, 24.5, 22.5),
-            item("Box", -0.7, 0.3, **BOX), item("Box", -0.7, 0.2, **BOX),
-            line(-0.6, 0.18, 15, 90), line(-0.8, 0.18, 15, 90), line(0.35, 0.8, 15, 90),
-            item("Box", 0.25, 0.93, **BOX), item("Box", 0.25, 0.83, **BOX),
-            line(0.15, 0.8, 15, 90),
-        ),
+        items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
+               line(-0.8, -0.81, 16), line(0.12, -0.59, 16), line(-0.34, -0.70, 24.5, 22.5),
+               item("Box", -0.7, 0.3, **BOX), item("Box", -0.7, 0.2, **BOX),
+               line(-0.6, 0.18, 15, 90), line(-0.8, 0.18, 15, 90), line(0.35, 0.8, 15, 90),
+               item("Box", 0.25, 0.93, **BOX), item("Box", 0.25, 0.83, **BOX),
+               line(0.15, 0.8, 15, 90)),
         shifts={"marker": (0.02, 0.02), "target": (0.02, 0.0)},
         subgoals=((0.7, -0.1),), boundary="RLC", marker_must_hit=True,
         target_hit_reward=2.0,  # appendix: 1; published task file: 2; as published
@@ -418,11 +416,9 @@ TASKS: dict[str, Task] = {
     ),
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9, "target"), goal=star(-0.8, -0.8),
-        items=(
-            ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
-            item("See-saw", -0.3, -0.1, size=30, damping=1, max_angle=30, mass=1, on_left=True),
-            line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20),
-        ),
+        items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
+               item("See-saw", -0.3, -0.1, size=30, damping=1, max_angle=30, mass=1, on_left=True),
+               line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20)),
         shifts={"ball": (0.05, 0.05), "target": (0.1, 0.1)},
         subgoals=((-0.1, -0.45),), boundary="RLC",
     ),
@@ -430,40 +426,32 @@ TASKS: dict[str, Task] = {
     "navigate": Task(
         marker=ball("Marker", -0.6, 0.75),
         target=ball("Target", 0.1, -0.24, "target"), goal=star(-0.65, -0.59, "goal"),
-        items=(
-            line(0.1, -0.35, 16, 0, "target"), line(-0.65, -0.7, 16, 0, "goal"),
-            line(-0.5, 0.1, 40),
-        ),
+        items=(line(0.1, -0.35, 16, 0, "target"), line(-0.65, -0.7, 16, 0, "goal"),
+               line(-0.5, 0.1, 40)),
         shifts={"target": (0.1, 0.1), "goal": (0.2, 0.2)},
     ),
     "belt": Task(
         target=ball("Target", 0.75, 0.75, "target", size=3), goal=star(0.5, -0.7, "goal"),
-        items=(
-            item("Conveyor Belt", 0.55, 0.25, size=7, speed=-2.5),
-            item("Conveyor Belt", 0.05, 0.2, size=7, speed=-2.5),
-            item("Conveyor Belt", -0.3, -0.6, size=7, speed=5.0),
-            line(0.41, -0.30, 65, kind="Line"), line(-0.34, -0.17, 12.7, 90, kind="Line"),
-        ),
+        items=(item("Conveyor Belt", 0.55, 0.25, size=7, speed=-2.5),
+               item("Conveyor Belt", 0.05, 0.2, size=7, speed=-2.5),
+               item("Conveyor Belt", -0.3, -0.6, size=7, speed=5.0),
+               line(0.41, -0.30, 65, kind="Line"), line(-0.34, -0.17, 12.7, 90, kind="Line")),
         shifts={"target": (0.1, 0.1), "goal": (0.1, 0.1)},
         subgoals=((-0.6, -0.35), (-0.15, 0.28), (-0.1, -0.5)),
         max_actions=50,  # appendix: 30; published task file: 50; as published
     ),
     "buckets": Task(
         target=ball("Target", 0.75, 0.75, "target", size=3), goal=star(-0.85, -0.85),
-        items=(
-            line(-0.48, -0.99, 45), line(-0.75, -0.15, 25),
-            line(-0.99, -0.7, 45, 90), line(0.05, -0.7, 45, 90),
-            item("Bucket", 0.05, -0.10, size=4), item("Bucket", -0.45, -0.10, size=4),
-        ),
+        items=(line(-0.48, -0.99, 45), line(-0.75, -0.15, 25),
+               line(-0.99, -0.7, 45, 90), line(0.05, -0.7, 45, 90),
+               item("Bucket", 0.05, -0.10, size=4), item("Bucket", -0.45, -0.10, size=4)),
         shifts={"target": (0.1, 0.1)}, subgoals=((-0.20, -0.10),),
     ),
     "cannon": Task(
         marker=ball("Marker", 0.8, 0.75, "marker"),
         target=ball("Target", 0.4, 0.11, "target"), goal=star(-0.7, -0.1, "goal"),
-        items=(
-            line(-0.1, 0.35, 55, 90), item("Cannon", -0.1, -0.8, angle=110, force=140),
-            line(0.4, 0.0, 8, 0, "target"),
-        ),
+        items=(line(-0.1, 0.35, 55, 90), item("Cannon", -0.1, -0.8, angle=110, force=140),
+               line(0.4, 0.0, 8, 0, "target")),
         shifts={"marker": (0.1, 0.1), "target": (0.05, 0.05), "goal": (0.05, 0.05)},
         boundary="RC", marker_must_hit=True,
     ),
@@ -480,19 +468,15 @@ TASKS: dict[str, Task] = {
     "ladder": Task(
         marker=ball("Marker", 0.7, 0.75),
         target=ball("Target", 0.35, -0.09, "target"), goal=star(-0.75, -0.09, "goal"),
-        items=(
-            line(0.35, -0.2, 5, 0, "target"), line(-0.75, -0.2, 5, 0, "goal"),
-            item("Ladder", -0.1, -0.1, **STAIR | {"size": 20}),
-        ),
+        items=(line(0.35, -0.2, 5, 0, "target"), line(-0.75, -0.2, 5, 0, "goal"),
+               item("Ladder", -0.1, -0.1, **STAIR | {"size": 20})),
         shifts={"target": (0.1, 0.1), "goal": (0.2, 0.2)},
     ),
     "basket": Task(
         target=ball("Basketball", 0.75, 0.75, "target", size=3.5),
         goal=item("Basket", -0.75, 0.65, "goal", size=10),
-        items=(
-            item("Ladder", 0.5, -0.4, **STAIR), item("Ladder", -0.05, 0.0, **STAIR),
-            item("Ladder", -0.55, 0.35, **STAIR),
-        ),
+        items=(item("Ladder", 0.5, -0.4, **STAIR), item("Ladder", -0.05, 0.0, **STAIR),
+               item("Ladder", -0.55, 0.35, **STAIR)),
         shifts={"target": (0.1, 0.1), "goal": (0.1, 0.1)},
         subgoals=((0.35, -0.05), (-0.15, 0.35)),
         max_actions=40,  # appendix: 30; published task file: 40; as published
@@ -970,14 +954,11 @@ class Canvas:
 # ---- A.3 the environment ----
 
 
-class Placement(enum.Enum):
-    """What came of the last action (`CreateEnv.placement`): words and colour for the caption."""
-
-    PLACED = ("placed", "#2a7f3f")
-    NO_OP = ("waits", "#6a6772")
-    NEAR_TOOL = ("too close to a tool", "#c1121f")
-    ON_SHAPE = ("blocked by a shape", "#c1121f")  # goals and subgoals included
-    OUTSIDE = ("outside the screen", "#c1121f")
+# What came of the last action (`CreateEnv.placement`): too close to a tool placed before; blocked by
+# a shape, goals and subgoals included; outside the screen.
+Placement = enum.Enum("Placement", "PLACED WAITED TOO_CLOSE BLOCKED OUTSIDE")
+PENALTY = {Placement.TOO_CLOSE: LAMBDA_OVERLAP, Placement.BLOCKED: LAMBDA_OVERLAP}
+PENALTY |= {Placement.OUTSIDE: LAMBDA_INVALID}
 
 
 class CreateEnv(gym.Env):
@@ -1036,11 +1017,8 @@ class CreateEnv(gym.Env):
         ids = check_ids(split_actions()["train"] if action_pool is None else action_pool)
         self.action_pool = np.sort(ids[ids != NO_OP])
         check_ids([NO_OP, *self.action_pool], num_available)
-        self.num_available, self.task, self.subgoal_reward = (
-            num_available,
-            TASKS[task],
-            subgoal_reward,
-        )
+        self.num_available, self.task = num_available, TASKS[task]
+        self.subgoal_reward = subgoal_reward
         self.render_mode, self.render_size = render_mode, render_size
         self.observation_space = spaces.Dict(
             state=spaces.Box(0, 255, (NUM_FRAMES, 84, 84), np.uint8),
@@ -1064,7 +1042,7 @@ class CreateEnv(gym.Env):
         self._centres: list[list[float]] = []  # norm, of the tools placed so far
         self._goal_hit, self._target_hit = False, self._marker is None
         self._still, self._actions, self._over = 0, 0, False
-        self._tool, self._position, self.placement = TOOLS[NO_OP], [0.0, 0.0], Placement.NO_OP
+        self._tool, self._position, self.placement = TOOLS[NO_OP], [0.0, 0.0], Placement.WAITED
         self._frames = np.zeros((NUM_FRAMES, 84, 84), np.uint8)
         self._trails = [(ball, []) for ball in (self._target, self._marker) if ball]
         self._pictures = [self._draw()] if self.render_mode else []
@@ -1079,7 +1057,9 @@ class CreateEnv(gym.Env):
         def add(item: Item, side: int = 1) -> Thing:
             dx, dy = shift.get(item.shift, (0.0, 0.0))
             x, y = to_units(side * item.x + dx), to_units(item.y + dy)
-            return self._add(build(item.tool, x, y, self._space.static_body))
+            self._things.append(build(item.tool, x, y, self._space.static_body))
+            self._space.add(*self._things[-1].parts)
+            return self._things[-1]
 
         self._marker = add(task.marker) if task.marker else None
         for one in task.items:
@@ -1095,11 +1075,6 @@ class CreateEnv(gym.Env):
         for subgoal in self._subgoals:
             subgoal.wants = self._marker or self._target
         self._repaint()
-
-    def _add(self, thing: Thing) -> Thing:
-        self._space.add(*thing.parts)
-        self._things.append(thing)
-        return thing
 
     def step(self, action: dict):
         """Place a tool, run 40 physics steps, settle accounts.
@@ -1132,7 +1107,7 @@ class CreateEnv(gym.Env):
     def _place(self) -> Placement:
         """Put the chosen tool at its position if it may stand there."""
         if self._tool.kind == "No-op":
-            return Placement.NO_OP
+            return Placement.WAITED
         # appendix: a penalty "for placing outside the scene"; published code: clips the position
         # first, so its penalty never fires; we do not clip, because the appendix has it
         if max(map(abs, self._position)) > 1.0:
@@ -1140,12 +1115,14 @@ class CreateEnv(gym.Env):
         # appendix: "overlap over existing objects"; published code: this distance to earlier tools,
         # or contact of the exact shapes with anything in the scene. As published.
         if any(math.dist(self._position, centre) <= MIN_TOOL_GAP for centre in self._centres):
-            return Placement.NEAR_TOOL
+            return Placement.TOO_CLOSE
         thing = build(self._tool, *map(to_units, self._position), self._space.static_body)
         if self._space.shape_query(thing.shape):  # sensors count
-            return Placement.ON_SHAPE
+            return Placement.BLOCKED
+        self._space.add(*thing.parts)
+        self._things.append(thing)
         self._centres.append(self._position)
-        self._paint([self._add(thing)])
+        self._paint([thing])
         return Placement.PLACED
 
     def _settle(self) -> tuple[bool, int, bool]:
@@ -1159,8 +1136,7 @@ class CreateEnv(gym.Env):
             self._target_hit = moved
         # published code: tests the goal before the target hit and never forgets a touch, so a goal
         # touched too soon counts at the hit, wherever the target is by then. We: a touch in the
-        # action of the hit counts, an earlier one does not, because the target has to come to rest
-        # with the goal, not to have passed it.
+        # action of the hit counts, an earlier one does not, because the hit is the way to the goal.
         self._goal.touched = self._goal_hit = self._target_hit and self._goal.touched
         # published code: a subgoal counts if touched at the end of an action; we: at any time in
         # it, because that is the rule of the goal
@@ -1176,11 +1152,7 @@ class CreateEnv(gym.Env):
     def _reward(self, goal: bool, subgoals: int, target_moved: bool) -> float:
         """Equation 3. Appendix: products of the bonus terms; published code: sums, as here."""
         # published code: the goal and each subgoal pay 0.1 less per placed tool; we: as Eq. 3
-        reward = LAMBDA_ALIVE + goal * LAMBDA_GOAL
-        if self.placement in (Placement.NEAR_TOOL, Placement.ON_SHAPE):
-            reward += LAMBDA_OVERLAP
-        if self.placement == Placement.OUTSIDE:
-            reward += LAMBDA_INVALID
+        reward = LAMBDA_ALIVE + goal * LAMBDA_GOAL + PENALTY.get(self.placement, 0.0)
         # C.3 names subgoals; push has none and was run without them all the same, so the reward for
         # the target hit must have been meant too.
         if self.subgoal_reward:
@@ -1234,18 +1206,18 @@ class CreateEnv(gym.Env):
                 alpha = 40 + 150 * k // min(len(trail), 90)
                 canvas.draw([([point], 1.1, None, shade(ball.kind.colour, 1.1, alpha))])
         canvas.draw(self._moving())
-        words, colour = self.placement.value if self._actions else ("", INK)
-        if self.placement not in (Placement.PLACED, Placement.NO_OP):  # a cross where it may not be
-            x, y = np.clip([to_units(value) for value in self._position], 2, WORLD - 2)
+        words, colour = self.placement.name.lower().replace("_", " "), "#2a7f3f"
+        if self.placement in PENALTY:  # a red cross where it may not stand
+            (x, y), colour = np.clip(np.add(self._position, 1) * 42, 2, WORLD - 2), "#c1121f"
             for v in (-1.6, 1.6):
                 canvas.draw([([(x - 1.6, y - v), (x + 1.6, y + v)], 0.8, None, colour)])
         if self._goal_hit:
-            words, colour, at = "goal!", "#2a7f3f", frame(*self._goal.pose())
+            words, (x, y) = "goal!", self._goal.pose()[:2]
             turns = [k / 18 * math.pi for k in range(37)]
-            ring = [at(7.1 * math.cos(turn), 7.1 * math.sin(turn)) for turn in turns]
+            ring = [(x + 7.1 * math.cos(turn), y + 7.1 * math.sin(turn)) for turn in turns]
             canvas.draw([(ring, 0.8, None, GREEN)])
-        name = self._tool.kind if self._actions else ""
-        canvas.write(f"{self._actions}/{self.task.max_actions}  {name}", words, colour)
+        name = f"{self._actions}/{self.task.max_actions}  {self._tool.kind}"
+        canvas.write(name, words if self._actions else "", colour)
         return canvas.picture()
 
     def render(self) -> np.ndarray | None:
@@ -1253,10 +1225,7 @@ class CreateEnv(gym.Env):
         return self.render_frames()[-1] if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step: 5, or 1 right after a reset, or none without render_mode.
-
-        Raises gymnasium's ResetNeeded before the first reset.
-        """
+        """Pictures of the last step: 5, or 1 right after a reset, or none without render_mode."""
         if self.render_mode and not self._pictures:
             raise gym.error.ResetNeeded("call reset() before the first picture")
         return self._pictures
@@ -1357,8 +1326,8 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
     91 never.
     """
     m, space, met = len(places), make_space(), []
-    note = lambda arbiter, *_: met.append(arbiter.shapes[0].thing)
-    space.on_collision(Contact.MOVING, None, begin=note)
+    note = {"begin": lambda arbiter, *_: met.append(arbiter.shapes[0].thing)}
+    space.on_collision(Contact.MOVING, None, **note)
     offsets = CELL * np.stack(np.divmod(np.arange(m), math.ceil(math.sqrt(m))), axis=1)  # (m, 2)
     tools = [build(tool, *at, space.static_body) for at in (to_units(places) + offsets).tolist()]
     balls = [build(PROBE_BALL, *at, None) for at in (to_units(start) + offsets).tolist()]
@@ -1387,8 +1356,8 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
 def _film(tool: Tool, states: np.ndarray) -> np.ndarray:
     """One tool's trajectories (n, 7, 7) as pictures, uint8 (n, 7, 48, 48).
 
-    "Collected identically as the state case, only the modality changes" (B): the whole scene, with
-    the tool where it stands.
+    B: "collected identically as the state case, only the modality changes". So the camera sees the
+    whole scene, with the tool where it stands.
     """
     blank, video = Canvas(PROBE_VIDEO), np.empty((*states.shape[:2], 48, 48), np.uint8)
     for frame_at in np.ndindex(states.shape[:2]):
@@ -1440,14 +1409,14 @@ def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, in
     return frames, total, length
 
 
-def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> Image.Image:
-    """Square pictures of one size on a sheet, a title under each."""
-    size, bar, gap = tiles[0].shape[1], 26, 10
+def sheet(tiles: dict[str, np.ndarray], columns: int) -> Image.Image:
+    """Square pictures of one size on a sheet, their titles under them."""
+    size, bar, gap = next(iter(tiles.values())).shape[1], 26, 10
     rows = math.ceil(len(tiles) / columns)
     shape = (columns * (size + gap) + gap, rows * (size + bar + gap) + gap)
     page, font = Image.new("RGB", shape, "white"), ImageFont.load_default(size=17)
     pen = ImageDraw.Draw(page)
-    for k, (tile, title) in enumerate(zip(tiles, titles, strict=True)):
+    for k, (title, tile) in enumerate(tiles.items()):
         x, y = gap + k % columns * (size + gap), gap + k // columns * (size + bar + gap)
         page.paste(Image.fromarray(tile[:size]), (x, y))  # without its caption
         pen.rectangle((x, y, x + size - 1, y + size - 1), outline="#b8b6c0")
@@ -1457,43 +1426,42 @@ def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> I
 
 def tasks_sheet() -> Image.Image:
     """Figure 7: the 12 tasks as they start."""
-    envs = [CreateEnv(task=task, render_mode="rgb_array", render_size=300) for task in TASKS]
-    for env in envs:
+    tiles = {}
+    for letter, task in zip("abcdefghijkl", TASKS, strict=False):
+        env = CreateEnv(task=task, render_mode="rgb_array", render_size=300)
         env.reset(seed=0)
-    titles = [f"({chr(97 + k)}) {task}" for k, task in enumerate(TASKS)]
-    return sheet([env.render() for env in envs], titles, 4)
+        tiles[f"({letter}) {task}"] = env.render()
+    return sheet(tiles, 4)
 
 
 def portrait(tools: Sequence[Tool], spots: Sequence[tuple], size: int) -> np.ndarray:
-    """Tools at their spots (units), uint8 (size, size, 3): the middle 60 x 60 units of the world."""
+    """Tools at their spots (units) in the middle 60 x 60 units, uint8 (size, size, 3)."""
     canvas, edge = Canvas(round(1.4 * size), colour=True), round(0.2 * size)
-    for tool, (x, y) in zip(tools, spots, strict=True):
-        canvas.draw(strokes(tool, (x, y, 0.0)))
+    for tool, spot in zip(tools, spots, strict=True):
+        canvas.draw(strokes(tool, (*spot, 0.0)))
     return canvas.picture()[edge : edge + size, edge : edge + size]
 
 
 def tools_sheet() -> Image.Image:
     """Four tools of each class, and how many there are 15 degrees apart."""
-    labels, spots = action_labels()[IS_COARSE], [(27, 57), (57, 57), (27, 27), (57, 27)]
-    tiles, titles = [], []
+    labels, tiles = action_labels(), {}
     for label in dict.fromkeys(labels[1:].tolist()):
-        members = [tool for tool, its in zip(np.flatnonzero(IS_COARSE), labels) if its == label]
-        four = [TOOLS[members[int(share * len(members))]] for share in (0.98, 0.12, 0.45, 0.7)]
-        tiles.append(portrait(four, spots, 300))
-        titles.append(f"{label} ({len(members)})")
-    return sheet(tiles, titles, 5)
+        ids = np.flatnonzero((labels == label) & IS_COARSE)
+        four = [TOOLS[ids[int(share * len(ids))]] for share in (0.98, 0.12, 0.45, 0.7)]
+        spots = [(27, 57), (57, 57), (27, 27), (57, 27)]
+        tiles[f"{label} ({len(ids)})"] = portrait(four, spots, 300)
+    return sheet(tiles, 5)
 
 
 def probe_sheet(name: str) -> Image.Image:
     """Probe-ball trajectories over tools, moved so that the tool stands in the middle."""
-    labels = action_labels()
+    labels, tiles = action_labels(), {}
     members = np.flatnonzero((np.char.lower(labels) == name.lower()) & IS_COARSE)
     if not (name.isdecimal() or len(members)):
         raise ValueError(
             f"unknown tool {name!r}: an id, or one of {', '.join(sorted(set(labels)))}"
         )
     ids = [int(name)] if name.isdecimal() else members[[len(members) * k // 10 for k in (1, 5, 9)]]
-    tiles = []
     for states, action in zip(action_observations(ids, 40, "state"), ids, strict=True):
         canvas = Canvas(420, colour=True)
         for k, path in enumerate(to_units(states[..., 2:4] - states[..., :2]).tolist()):
@@ -1501,59 +1469,56 @@ def probe_sheet(name: str) -> Image.Image:
             dots = [([point], 0.7 + 0.22 * age, None, hue) for age, point in enumerate(path)]
             canvas.draw([(path, 0.3, None, (*hue, 150)), *dots])
         canvas.draw(strokes(TOOLS[action], (WORLD / 2, WORLD / 2, 0.0)))
-        tiles.append(canvas.picture())
-    return sheet(tiles, [f"{labels[action]}, id {action}" for action in ids], len(ids))
+        tiles[f"{labels[action]}, id {action}"] = canvas.picture()
+    return sheet(tiles, len(ids))
 
 
 def play(env: CreateEnv, seed: int = 0) -> None:
-    """A window to play in: click on a tool (or arrow keys), click on the scene to place it, space
-    to wait. To the right is what the policy sees, the newest picture at the bottom.
+    """Place tools by mouse: click on a tool (or arrow keys), then on the scene; space waits.
+
+    To the right is what the policy sees, the newest picture at the bottom.
     """
     import matplotlib.pyplot as plt  # here, so that no other command needs a display
 
-    columns, chosen, total, said = 5, 0, 0.0, ""
-    observation, _ = env.reset(seed=seed)
+    (observation, _), chosen, total, said = env.reset(seed=seed), NO_OP, 0.0, ""
     figure, panels = plt.subplots(1, 3, figsize=(13, 6), width_ratios=(2, 4, 1.4))
 
     def show() -> None:
         tiles = [portrait([TOOLS[action]], [(42, 42)], 70) for action in env.available]
         tiles[chosen] = tiles[chosen] // 4 * 3  # in the shade
-        tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
-        strip = np.vstack(
-            [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
-        )
-        extents = (0, columns, len(tiles) // columns, 0), (0, WORLD, -CAPTION, WORLD), None
+        tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % 5)
+        strip = np.vstack([np.hstack(tiles[k : k + 5]) for k in range(0, len(tiles), 5)])
+        titles = TOOLS[env.available[chosen]].kind, f"return {total:.2f}{said}", "the policy sees"
         pictures = strip, env.render(), np.vstack(observation["state"])
-        titles = TOOLS[env.available[chosen]].kind, f"return {total:.2f} {said}", "the policy sees"
-        for axes, picture, extent, title in zip(panels, pictures, extents, titles, strict=True):
+        extents = (0, 5, len(tiles) // 5, 0), (0, WORLD, -CAPTION, WORLD), None
+        for axes, title, picture, extent in zip(panels, titles, pictures, extents, strict=True):
             axes.clear()
-            axes.set_axis_off()
-            axes.set_title(title)
+            axes.set(title=title, xticks=[], yticks=[])
             axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent)
         figure.canvas.draw_idle()
 
     def on_event(event) -> None:
         nonlocal observation, chosen, total, said
-        key, place, action = getattr(event, "key", None), event.inaxes, None
-        ways = {"left": -1, "right": 1, "up": -columns, "down": columns}
+        action = None
         if event.name == "key_press_event":
-            chosen = (chosen + ways.get(key, 0)) % env.num_available
-            action = {"choice": NO_OP, "position": (0, 0)} if key == " " else None
-        elif place is panels[0]:
-            chosen = min(int(event.ydata) * columns + int(event.xdata), env.num_available - 1)
-        elif place is panels[1]:
-            position = (event.xdata * 2 / WORLD - 1, event.ydata * 2 / WORLD - 1)
+            step = {"left": -1, "right": 1, "up": -5, "down": 5}.get(event.key, 0)
+            chosen = (chosen + step) % env.num_available
+            action = {"choice": NO_OP, "position": (0, 0)} if event.key == " " else None
+        elif event.inaxes is panels[0]:
+            chosen = min(int(event.ydata) * 5 + int(event.xdata), env.num_available - 1)
+        elif event.inaxes is panels[1]:
+            position = event.xdata * 2 / WORLD - 1, event.ydata * 2 / WORLD - 1
             action = {"choice": chosen, "position": position}
         if action:
             observation, reward, terminated, truncated, info = env.step(action)
             total, said = total + reward, ""
             if terminated or truncated:
-                said = f"at the end, {'goal' if info[METRIC] else 'no goal'}; the next episode:"
+                said = f" after {total:.2f} and {'a' if info[METRIC] else 'no'} goal"
                 observation, total = env.reset()[0], 0.0
         show()
 
-    for event in ("button_press_event", "key_press_event"):
-        figure.canvas.mpl_connect(event, on_event)
+    for name in ("button_press_event", "key_press_event"):
+        figure.canvas.mpl_connect(name, on_event)
     show()
     plt.show()
 
@@ -1580,10 +1545,10 @@ def main(args: Args) -> None:
     env = CreateEnv(task=args.task, render_mode="rgb_array")
     if args.play:
         return play(env, args.seed)
-    args.out.mkdir(parents=True, exist_ok=True)
     sheets = {"tasks": tasks_sheet} if args.all_tasks else {}
     sheets |= {"tools": tools_sheet} if args.show_tools else {}
     sheets |= {"probe": functools.partial(probe_sheet, args.show_probe)} if args.show_probe else {}
+    args.out.mkdir(parents=True, exist_ok=True)
     for name, draw in sheets.items():
         draw().save(args.out / f"create_{name}.png")
         print(f"wrote {args.out / f'create_{name}.png'}")
@@ -1593,11 +1558,10 @@ def main(args: Args) -> None:
         frames, total, length = play_episode(env, best)
         path = args.out / f"create_{args.task}.gif"
         save_gif(path, frames + frames[-1:] * 20, env.metadata["render_fps"])  # time to see the end
-        print(f"best of {args.tries} random episodes of {args.task}: seed {best}, {length} actions, "
-              f"return {total:.2f}; wrote {path}")  # fmt: skip
+        print(f"{args.task}, best of {args.tries} random episodes: seed {best}, {length} actions,")
+        print(f"return {total:.2f}; wrote {path}")
     for split in ("default", "full", "analysis"):
-        sizes = ", ".join(f"{part} {len(ids):,}" for part, ids in split_actions(split).items())
-        print(f"split {split:9} {sizes}")
+        print(split, "split:", {part: len(ids) for part, ids in split_actions(split).items()})
 
 
 if __name__ == "__main__":
