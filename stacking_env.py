@@ -14,10 +14,9 @@ are of sizes (or classes) never used in training, so the agent must understand p
 
 Commands:
 
-    python stacking_env.py                     # a planned and a random tower as GIFs, a sheet of the
-                                               # shapes, in runs/demo (about 20 seconds)
-    python stacking_env.py --split full        # the same with Table 2's unseen classes on offer
-    python stacking_env.py --placement 2d      # C.6
+    python stacking_env.py                  # a planned and a random tower as GIFs, a sheet of all
+                                            # families, in runs/demo (about 10 seconds)
+    python stacking_env.py --split full     # the same with Table 2's unseen classes on offer
 
 Paper map (appendix -> here):
 
@@ -76,7 +75,9 @@ CENTRE, AXIS_GAP = (-0.2, 0.2), (1.0, 1.6)  # published code, m: "random locatio
 SIM_STEPS = 300  # A.4 "acts every 300 physics simulator steps"
 TIME_STEP = 0.01  # published code, s
 GRAVITY = -9.81  # m/s^2
-SOLVER_ITERATIONS = 50  # Bullet's default; with 20, tall towers creep and fall
+# ours: at most 50 iterations of the contact solver per step (with 20, tall towers creep and fall),
+# fewer once it has converged: 1e-5 in place of Bullet's 1e-7 saves a tenth of a step's time.
+SOLVER_ITERATIONS, SOLVER_RESIDUAL = 50, 1e-5
 # published code: density 1000, so masses differ 1000-fold, which breaks Bullet's solver; we give
 # every shape mass 1 with its true inertia, and towers stand as long as they would in reality.
 MASS = 1.0
@@ -236,24 +237,16 @@ _rng = np.random.default_rng(42)  # published code: one colour per shape, from t
 COLOURS = [random_colour(_rng) for _ in SHAPES]
 
 
-class Body(NamedTuple):
-    """A family's solid at scale 1 and mass 1, as Bullet's body frame wants it."""
-
-    com: np.ndarray  # (3,) centre of mass, from the origin
-    axes: np.ndarray  # (3, 3), columns: principal axes of inertia
-    moments: np.ndarray  # (3,) principal moments of inertia
-
-
 @functools.cache
-def mass_properties(family: Family) -> Body:
-    """Centre of mass, principal axes and moments: exact, from a decomposition in tetrahedra."""
+def mass_properties(family: Family) -> tuple[np.ndarray, Rotation, np.ndarray]:
+    """Centre of mass (3,), principal axes, moments of inertia (3,) about them; scale 1, mass 1."""
     # Of the solids with curved sides that Bullet has itself, the moments are known in closed form.
-    # Capsule: a tube (mass share 3/5) and two half-balls (2/5), each 3/8 beyond its end of the tube.
+    # Capsule: a tube (mass share 3/5) and two half-balls (2/5), each 3/8 beyond an end of the tube.
     capsule = 0.6 * 7 / 12 + 0.4 * (0.4 + 1 + 2 * 3 / 8), 0.6 / 2 + 0.4 * 0.4  # across, along z
     curved = {"sphere": (0.4, 0.4), "cylinder": (7 / 12, 1 / 2), "capsule": capsule}
     if family.kind in curved:
         across, along = curved[family.kind]
-        return Body(np.zeros(3), np.eye(3), np.array([across, across, along]))
+        return np.zeros(3), Rotation.identity(), np.array([across, across, along])
     tets = np.vstack([part[Delaunay(part).simplices] for part in family.parts()])  # (T, 4, 3)
     volumes = np.abs(np.linalg.det(tets[:, 1:] - tets[:, :1])) / 6  # (T,)
     shares = volumes / volumes.sum()
@@ -264,13 +257,14 @@ def mass_properties(family: Family) -> Body:
     moments = np.einsum("t,tvi,tvj->ij", shares, corners, corners)
     moments = (moments + np.einsum("t,ti,tj->ij", shares, total, total)) / 20
     inertia = np.trace(moments) * np.eye(3) - moments
-    if np.abs(inertia - np.diag(np.diag(inertia))).max() < 1e-9:  # all but two of the triangles
-        return Body(com, np.eye(3), np.diag(inertia))
+    if np.allclose(inertia, np.diag(np.diag(inertia)), atol=1e-9):  # all but two of the triangles
+        return com, Rotation.identity(), np.diag(inertia)
     principal, axes = np.linalg.eigh(inertia)
-    return Body(com, axes * np.linalg.det(axes), principal)  # a rotation, not a mirror image
+    axes *= np.linalg.det(axes)  # a rotation, not a mirror image
+    return com, Rotation.from_matrix(axes), principal
 
 
-# ---- ids, labels, features ----
+# ---- A.4: ids, labels, features, split ----
 
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
@@ -306,9 +300,6 @@ def engineered_representations() -> np.ndarray:
     return table
 
 
-# ---- A.4: action set split ----
-
-
 def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray]:
     """Train, validation and test ids, about 2:1:1 (A.4).
 
@@ -328,16 +319,16 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     # published code: a draw per family. Then a cone would be in training and its copy, the other
     # cone, in the test. The same solid is one draw here: both cones; hat and triangle; and the
     # smallest of both rectangles, the only scale that these have in common.
-    seen: dict[tuple[str, float], bool] = {}  # Shape.size() -> used in training?
+    chosen: dict[tuple[str, float], bool] = {}  # Shape.size() -> used in training?
     for family in FAMILIES:
         sizes = list(dict.fromkeys(shape.size() for shape in SHAPES if shape.family is family))
-        new = [size for size in sizes if size not in seen]
-        wanted = len(sizes) // 2 - sum(seen.get(size, False) for size in sizes)
-        seen |= {new[k]: rank < wanted for rank, k in enumerate(rng.permutation(len(new)))}
+        new = [size for size in sizes if size not in chosen]
+        wanted = len(sizes) // 2 - sum(chosen.get(size, False) for size in sizes)
+        chosen |= {new[k]: rank < wanted for rank, k in enumerate(rng.permutation(len(new)))}
     if split == "full":  # Table 2: here `triangle` and `hat`, one solid on two faces, are apart
         train = np.array([shape.family.full_train for shape in SHAPES])
     else:
-        train = np.array([seen[shape.size()] for shape in SHAPES])
+        train = np.array([chosen[shape.size()] for shape in SHAPES])
     # A.4: "randomly splitting the test set into half", but what looks the same goes together
     twins: dict[tuple, list[int]] = {}
     for i in np.flatnonzero(~train).tolist():
@@ -361,79 +352,73 @@ class Bullet:
         weakref.finalize(self, p.disconnect, self.client)  # it ends when nobody holds it any more
 
     def __getattr__(self, name: str) -> Any:
-        return functools.partial(getattr(p, name), physicsClientId=self.client)
-
-
-# pybullet never frees a list of vertices that it was given. So each family's lists are made once,
-# at scale 1 (meshScale does the rest): with new lists, an episode would leak 200 kB and more.
-
-
-@functools.cache
-def hull(family: Family) -> list:
-    """Corners of the collision shape, a list of V [x, y, z]."""
-    return family.points.tolist()
+        function = functools.partial(getattr(p, name), physicsClientId=self.client)
+        setattr(self, name, function)  # the next time it is found at once
+        return function
 
 
 @functools.cache
-def mesh(family: Family) -> dict[str, list]:
-    """Surface for the pictures: T triangles with three vertices and normals of their own each.
+def surface(family: Family) -> dict[str, list]:
+    """T triangles at scale 1, with three vertices and normals of their own each, for the pictures.
 
-    With the normals of its plane at all three corners a face is evenly bright, and edges are sharp.
+    With the normal of its plane at all three corners a face is evenly bright, and edges are sharp.
     """
+    # pybullet never frees a list of vertices that it was given. So each family's lists are made
+    # once (meshScale does the rest): with new lists, an episode would leak 200 kB and more.
     vertices, normals = [], []
     for part in family.parts():
-        surface = ConvexHull(part)
-        outward = surface.equations[:, :3]  # (T, 3)
-        a, b, c = np.moveaxis(part[surface.simplices], 1, 0)  # (T, 3) each
-        inside_out = (np.cross(b - a, c - a) * outward).sum(axis=1, keepdims=True) < 0
+        hull = ConvexHull(part)
+        outward = hull.equations[:, :3]  # (T, 3)
+        a, b, c = np.moveaxis(part[hull.simplices], 1, 0)  # (T, 3) each
+        inside_out = (np.cross(b - a, c - a) * outward).sum(axis=1, keepdims=True) < 0  # (T, 1)
         b, c = np.where(inside_out, c, b), np.where(inside_out, b, c)
         vertices += np.stack([a, b, c], axis=1).reshape(-1, 3).tolist()  # (3 T, 3)
         normals += outward.repeat(3, axis=0).tolist()  # (3 T, 3)
     return {"vertices": vertices, "normals": normals, "indices": list(range(len(vertices)))}
 
 
-def collision_shape(bullet: Bullet, family: Family, scale: float) -> int:
-    """Tell Bullet the exact solid; returns the number that it gives it."""
-    if family.kind == "sphere":
-        return bullet.createCollisionShape(p.GEOM_SPHERE, radius=scale)
-    if family.kind in ("cylinder", "capsule"):
-        geom = p.GEOM_CYLINDER if family.kind == "cylinder" else p.GEOM_CAPSULE
-        return bullet.createCollisionShape(geom, radius=scale, height=2 * scale)
-    if family.kind == "box":
-        parts = scale * family.parts()  # (P, 8, 3)
-        return bullet.createCollisionShapeArray(
-            shapeTypes=[p.GEOM_BOX] * len(parts),
-            halfExtents=(np.ptp(parts, axis=1) / 2).tolist(),
-            collisionFramePositions=parts.mean(axis=1).tolist(),
-        )
-    # Points only, Bullet makes the hull. With triangles it would fall through the table, silently.
-    return bullet.createCollisionShape(p.GEOM_MESH, vertices=hull(family), meshScale=[scale] * 3)
+@functools.cache
+def corners(family: Family) -> list[list[float]]:
+    """The points as a list, for the collision shape; one per family, as above."""
+    return family.points.tolist()
 
 
 def add_shape(bullet: Bullet, shape_id: int, origin: Sequence[float], rgb: Sequence[float]) -> int:
-    """Put an upright shape's origin at a place in the world; returns Bullet's number of the body."""
+    """Put an upright shape's origin at a place in the world; returns Bullet's number of it."""
     family, scale, angle = SHAPES[shape_id]
-    body = mass_properties(family)
-    # Its body frame has the centre of mass as origin and the principal axes as axes. That frame is
-    # what getBasePositionAndOrientation tells later; what we give here is the shape's own frame.
-    number = bullet.createMultiBody(
-        MASS,
-        collision_shape(bullet, family, scale),
-        bullet.createVisualShape(
-            p.GEOM_MESH, **mesh(family), meshScale=[scale] * 3, rgbaColor=(*rgb, 1)
-        ),
-        basePosition=list(origin),
-        baseOrientation=p.getQuaternionFromEuler((0, 0, angle)),
-        baseInertialFramePosition=(scale * body.com).tolist(),
-        baseInertialFrameOrientation=Rotation.from_matrix(body.axes).as_quat().tolist(),
+    zoom = {"meshScale": [scale] * 3}
+    if family.kind == "sphere":
+        solid = bullet.createCollisionShape(p.GEOM_SPHERE, radius=scale)
+    elif family.kind in ("cylinder", "capsule"):
+        geom = p.GEOM_CYLINDER if family.kind == "cylinder" else p.GEOM_CAPSULE
+        solid = bullet.createCollisionShape(geom, radius=scale, height=2 * scale)
+    elif family.kind == "box":
+        parts = scale * family.parts()  # (P, 8, 3)
+        solid = bullet.createCollisionShapeArray(
+            [p.GEOM_BOX] * len(parts),
+            halfExtents=(np.ptp(parts, axis=1) / 2).tolist(),
+            collisionFramePositions=parts.mean(axis=1).tolist(),
+        )
+    else:  # Points only, Bullet makes the hull. With triangles it would fall through the table.
+        solid = bullet.createCollisionShape(p.GEOM_MESH, vertices=corners(family), **zoom)
+    look = bullet.createVisualShape(p.GEOM_MESH, **surface(family), **zoom, rgbaColor=(*rgb, 1))
+    # The body's frame has its origin at the centre of mass and goes along the principal axes; this
+    # is what getBasePositionAndOrientation tells later. The pose here is of the shape's own frame.
+    com, axes, moments = mass_properties(family)
+    body = bullet.createMultiBody(
+        MASS, solid, look, list(origin), p.getQuaternionFromEuler((0, 0, angle)),
+        baseInertialFramePosition=(scale * com).tolist(),
+        baseInertialFrameOrientation=axes.as_quat().tolist(),  # x, y, z, w
         useMaximalCoordinates=1,  # plain rigid bodies, 1.4 times faster than Bullet's multibodies
-    )
+    )  # fmt: skip
     # Bullet would take the inertia of the bounding box. Mass must be given along with the inertia:
     # alone, it makes the body massless and its pose NaN.
-    inertia = (MASS * scale**2 * body.moments).tolist()
-    bullet.changeDynamics(number, -1, mass=MASS, localInertiaDiagonal=inertia)
-    bullet.changeDynamics(number, -1, **FRICTION, restitution=0, linearDamping=0, angularDamping=0)
-    return number
+    inertia = (MASS * scale**2 * moments).tolist()
+    bullet.changeDynamics(
+        body, -1, mass=MASS, localInertiaDiagonal=inertia, **FRICTION, restitution=0,
+        linearDamping=0, angularDamping=0,
+    )  # fmt: skip
+    return body
 
 
 def empty_world(bullet: Bullet) -> None:
@@ -441,42 +426,30 @@ def empty_world(bullet: Bullet) -> None:
     bullet.resetSimulation()
     bullet.setGravity(0, 0, GRAVITY)
     bullet.setPhysicsEngineParameter(
-        fixedTimeStep=TIME_STEP,
-        numSolverIterations=SOLVER_ITERATIONS,
-        deterministicOverlappingPairs=1,
-    )
+        fixedTimeStep=TIME_STEP, numSolverIterations=SOLVER_ITERATIONS,
+        solverResidualThreshold=SOLVER_RESIDUAL, deterministicOverlappingPairs=1,
+    )  # fmt: skip
     # The floor has no end (published code: invisible walls at the left and at the back). What is
     # drawn of it is a board of 8 x 4 m.
     plane = bullet.createCollisionShape(p.GEOM_PLANE)
     board = bullet.createVisualShape(
-        p.GEOM_BOX,
-        halfExtents=TABLE,
-        rgbaColor=(*WOOD, 1),
-        visualFramePosition=(0, 0, -TABLE[2]),
+        p.GEOM_BOX, halfExtents=TABLE, rgbaColor=(*WOOD, 1), visualFramePosition=(0, 0, -TABLE[2])
     )
     floor = bullet.createMultiBody(0, plane, board, useMaximalCoordinates=1)
     bullet.changeDynamics(floor, -1, **FRICTION, restitution=0)
 
 
-def photograph(
-    bullet: Bullet,
-    eye: Sequence[float],
-    target: Sequence[float],
-    size: int = SIZE,
-    fov: float = FOV,
-    sky: Sequence[int] = (0, 0, 0),
-) -> np.ndarray:
-    """What a camera at `eye` that looks at `target` sees, (size, size, 3) uint8."""
-    view = p.computeViewMatrix(eye, target, (0, 0, 1))
+def photograph(bullet: Bullet, camera: tuple, size=SIZE, fov=FOV, sky=(0, 0, 0)) -> np.ndarray:
+    """The picture of a camera (eye, target), (size, size, 3) uint8; `sky` where nothing is."""
+    view = p.computeViewMatrix(*camera, (0, 0, 1))
     lens = p.computeProjectionMatrixFOV(fov, 1, 0.1, 40)  # square; sees from .1 to 40 m
     axes = np.reshape(view, (4, 4))[:3, :3]  # columns: right, up, back in the world
     _, _, rgba, _, owner = bullet.getCameraImage(
         size, size, view, lens, renderer=p.ER_TINY_RENDERER, lightDirection=(axes @ LIGHT).tolist(),
         lightAmbientCoeff=AMBIENT, lightDiffuseCoeff=DIFFUSE, lightSpecularCoeff=0, shadow=0,
     )  # fmt: skip
-    rgb = rgba[:, :, :3].copy()  # (size, size, 3)
-    rgb[owner < 0] = sky  # owner: number of the body that is seen, -1 where there is none
-    return rgb
+    # owner (size, size): number of the body that is seen, -1 where there is none
+    return np.where(owner[:, :, None] < 0, np.uint8(sky), rgba[:, :, :3])
 
 
 def grey(rgb: np.ndarray) -> np.ndarray:
@@ -567,10 +540,8 @@ class StackingEnv(gym.Env):
         self.num_available, self.render_mode = num_available, render_mode
         self.placement, self.early_stop = placement, early_stop
         self.observation_space = spaces.Dict(
-            {
-                "state": spaces.Box(0, 255, (FRAMES, SIZE, SIZE), np.uint8),
-                "available": spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
-            }
+            state=spaces.Box(0, 255, (FRAMES, SIZE, SIZE), np.uint8),
+            available=spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
         )
         parts = {"choice": spaces.Discrete(num_available), "stop": spaces.Discrete(2)}
         if PLACEMENTS[placement]:
@@ -601,7 +572,7 @@ class StackingEnv(gym.Env):
             self._add(cylinder, x, 0.0, 0.0, random_colour(rng))
         self._settle()
         self._stack = np.zeros((FRAMES, SIZE, SIZE), dtype=np.uint8)
-        return self._observe(), {}
+        return self._observe(moved=True), {}
 
     def step(self, action: dict) -> tuple[dict, float, bool, bool, dict]:
         """One action; see the class for what it must be."""
@@ -614,7 +585,9 @@ class StackingEnv(gym.Env):
         self._steps, self._frames = self._steps + 1, []
         shape_id = int(self.available[choice])
         # A.4: "trying to place it again does nothing"; ours: nor does a place beyond [-1, 1]
-        if not stop and shape_id not in self.shape_ids[2:] and (np.abs(place) <= 1).all():
+        inside = bool((np.abs(place) <= 1).all())
+        drop = not stop and inside and shape_id not in self.shape_ids[2:]
+        if drop:
             for body in self._bodies:  # published code: all stands still when a shape is added
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
             # C.6: No Place is over the centre; in 1D Place "the y-coordinate ... is fixed"
@@ -628,7 +601,7 @@ class StackingEnv(gym.Env):
             reward = eq4_reward(heights)
             # published code: the score uses shape origins; ours: centres of mass, as in the reward
             info = {METRIC: float(heights.max())}
-        return self._observe(), reward, terminated, truncated, info
+        return self._observe(moved=drop), reward, terminated, truncated, info
 
     def _add(self, shape_id: int, x: float, y: float, top: float, rgb: tuple) -> None:
         """Let a shape go with its origin over (x, y) and its lowest point just above `top`."""
@@ -675,15 +648,17 @@ class StackingEnv(gym.Env):
         highest = 0.0
         for shape_id, centre, rotation in zip(self.shape_ids, *self.poses(), strict=True):
             family, scale, _ = SHAPES[shape_id]
-            body = mass_properties(family)
-            up = body.axes @ rotation[2]  # (3,) the world's up in the shape's own frame
-            highest = max(highest, centre[2] + scale * ((family.points - body.com) @ up).max())
+            com, axes, _ = mass_properties(family)
+            up = axes.apply(rotation[2])  # (3,) the world's up in the shape's own frame
+            highest = max(highest, centre[2] + scale * ((family.points - com) @ up).max())
         return float(highest)
 
-    def _observe(self) -> dict[str, np.ndarray]:
-        """A.4 State: push a picture of the scene onto the stack of four."""
-        # where nothing was placed, this is the last picture once more
-        picture = grey(photograph(self._bullet, *(RAISED if self.placement == "2d" else FRONT)))
+    def _observe(self, moved: bool) -> dict[str, np.ndarray]:
+        """A.4 State: push a picture onto the stack of four; the last one again if nothing moved."""
+        picture = self._stack[-1]
+        if moved:
+            camera = RAISED if self.placement == "2d" else FRONT
+            picture = grey(photograph(self._bullet, camera))
         self._stack = np.concatenate([self._stack[1:], picture[None]])  # (4, 84, 84)
         return {"state": self._stack.copy(), "available": self.available.copy()}
 
@@ -698,7 +673,7 @@ class StackingEnv(gym.Env):
         return colour_picture(self._bullet, caption)
 
     def render_frames(self) -> list[np.ndarray]:
-        """Colour pictures of the last reset or step, the fall included; empty without render_mode."""
+        """Colour pictures of the last reset or step, the fall included; [] without render_mode."""
         return [*self._frames, self.render()] if self.render_mode else []
 
     def close(self) -> None:
@@ -739,12 +714,10 @@ def _views(shape_id: int, num_views: int, seed: int) -> np.ndarray:
     random = np.random.default_rng([seed, shape_id]).random((num_views, 2))
     out = np.empty((num_views, SIZE, SIZE), dtype=np.uint8)
     for picture, (turn, lift) in zip(out, random.tolist(), strict=True):
-        x, y = (
-            VIEW_RADIUS * math.cos(2 * math.pi * turn),
-            VIEW_RADIUS * math.sin(2 * math.pi * turn),
-        )
-        z = VIEW_HEIGHT[0] + (VIEW_HEIGHT[1] - VIEW_HEIGHT[0]) * lift
-        picture[:] = grey(photograph(bullet, (x, y, z), (0, 0, 0)))  # it looks at the origin
+        turn *= 2 * math.pi
+        height = VIEW_HEIGHT[0] + lift * (VIEW_HEIGHT[1] - VIEW_HEIGHT[0])
+        eye = VIEW_RADIUS * math.cos(turn), VIEW_RADIUS * math.sin(turn), height
+        picture[:] = grey(photograph(bullet, (eye, (0, 0, 0))))  # it looks at the shape's origin
     return out
 
 
@@ -788,51 +761,38 @@ def action_observations(
 
 # ---- pictures for people ----
 
-COLOUR_SIZE = 336  # ours: four of the policy's pictures, each twice as large, are as high
-COLOUR_VIEW = (0.0, -10.5, 5.0), (0.0, 0.0, 2.45)  # ours: eye, target
-SKY = (234, 242, 250)
+COLOUR_SIZE = 336  # ours: two of the policy's pictures, each twice as large, are as high
+COLOUR_CAMERA = (0.0, -12.0, 5.0), (0.0, 0.0, 3.2)  # ours: eye, target; up to a height of 7.5
+PORTRAIT = (0.0, -3.0, 1.7), (0.0, 0.0, 0.4)  # ours: for one shape
+COLOUR_FOV, SKY, INK = 38.0, (234, 242, 250), (60, 50, 40)  # ours: degrees, two colours
 FRAME_EVERY = 20  # ours: simulation steps per picture; at 10 a second, twice as fast as real
 
 
-def colour_picture(
-    bullet: Bullet, caption: str = "", size: int = COLOUR_SIZE, view: tuple = COLOUR_VIEW,
-    fov: float = 38.0,
-) -> np.ndarray:  # fmt: skip
-    """The scene in colour, with a line of text at the top, (size, size, 3) uint8."""
+def colour_picture(bullet: Bullet, caption: str, camera=COLOUR_CAMERA, size=COLOUR_SIZE):
+    """The scene in colour, with a text in the corner, (size, size, 3) uint8."""
     # drawn at twice the size, then averaged: smooth edges
-    image = Image.fromarray(photograph(bullet, *view, 2 * size, fov, SKY)).reduce(2)
-    font = ImageFont.load_default(size=14)
-    ImageDraw.Draw(image).text((8, 5), caption, fill=(60, 50, 40), font=font)
+    image = Image.fromarray(photograph(bullet, camera, 2 * size, COLOUR_FOV, SKY)).reduce(2)
+    ImageDraw.Draw(image).text((8, 5), caption, INK, ImageFont.load_default(size=14))
     return np.asarray(image)
 
 
-def policy_view(state: np.ndarray) -> np.ndarray:
-    """The four pictures (4, 84, 84) that the policy sees, as (336, 336, 3), the newest last."""
-    grid = state.reshape(2, 2, SIZE, SIZE).swapaxes(1, 2).reshape(2 * SIZE, 2 * SIZE)
-    grid = grid.repeat(2, axis=0).repeat(2, axis=1)  # (336, 336)
-    grid[SIZE * 2 - 1 :: SIZE * 2] = grid[:, SIZE * 2 - 1 :: SIZE * 2] = 90  # lines between them
-    return np.stack([grid] * 3, axis=2)
-
-
-def shape_sheet(size: int = 150) -> Image.Image:
+def shape_sheet(size: int = 168) -> Image.Image:
     """All 16 families: smallest, middle and largest shape in colour, three views of the largest."""
     bullet, rows = Bullet(), []
     for family in FAMILIES:
         ids = [i for i, shape in enumerate(SHAPES) if shape.family is family]
-        cells = []
-        for shape_id in (ids[0], ids[len(ids) // 2 + family.angles // 3], ids[-1]):
+        captions, cells = [f"{family.name}\n{len(ids)}, {family.label}", "", ""], []
+        picked = ids[0], ids[len(ids) // 2 + family.angles // 3], ids[-1]
+        for shape_id, caption in zip(picked, captions, strict=True):
             empty_world(bullet)
             z = -SHAPES[shape_id].scale * family.points[:, 2].min()
             add_shape(bullet, shape_id, (0, 0, z), COLOURS[shape_id])
-            text = f"{family.name}: {len(ids)}, {family.label}" if not cells else ""
-            view = (0.0, -3.6, 2.0), (0.0, 0.0, 0.45)
-            cells.append(colour_picture(bullet, text, size, view, fov=32.0))
-        for grey_view in _views(ids[-1], 3, 0):
-            image = Image.fromarray(grey_view).convert("RGB").resize((size, size))
-            cells.append(np.asarray(image))
-        rows.append(np.concatenate(cells, axis=1))
-    left, right = np.concatenate(rows[:8]), np.concatenate(rows[8:])
-    return Image.fromarray(np.concatenate([left, right], axis=1))
+            cells.append(colour_picture(bullet, caption, PORTRAIT, size))
+        for view in _views(ids[-1], 3, 0):
+            cells.append(np.asarray(Image.fromarray(view).convert("RGB").resize((size, size), 0)))
+        rows.append(np.concatenate(cells, axis=1))  # (size, 6 size, 3)
+    halves = [np.concatenate(half) for half in (rows[:8], rows[8:])]
+    return Image.fromarray(np.concatenate(halves, axis=1))
 
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
@@ -877,7 +837,9 @@ def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, li
     left = float(np.clip(env.poses()[0][0, 0], -1, 1))  # greedy: all over the left cylinder
     size, info, frames = PLACEMENTS[env.placement], {}, []
     for step in itertools.count():
-        seen = policy_view(obs["state"])
+        # (4, 84, 84) -> (2 x 84, 2 x 84), the newest last, then each pixel as 2 x 2 in grey
+        grid = obs["state"].reshape(2, 2, SIZE, SIZE).swapaxes(1, 2).reshape(2 * SIZE, 2 * SIZE)
+        seen = grid.repeat(2, axis=0).repeat(2, axis=1)[..., None].repeat(3, axis=2)
         frames += [np.concatenate([frame, seen], axis=1) for frame in env.render_frames()]
         if info:
             return info[METRIC], frames
@@ -893,32 +855,22 @@ def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, li
 class Args:
     """Build a planned and a random tower, draw the shapes, print a summary."""
 
-    seed: int = 0
-    """seed of the split and of the episodes"""
-    out: Path = Path("runs/demo")
-    """folder for the GIFs and the sheet"""
-    split: Literal["default", "full"] = "default"
-    """how the shapes are divided (A.4, Table 2)"""
-    pool: Literal["train", "valid", "test"] = "test"
-    """part of the split whose shapes are on offer"""
-    num_available: int = NUM_AVAILABLE
-    """shapes on offer in an episode (Table 3)"""
-    placement: Literal["none", "1d", "2d"] = "1d"
-    """where the agent may drop shapes (C.6)"""
+    seed: int = 0  # of the split and of the episodes
+    out: Path = Path("runs/demo")  # folder for the GIFs and the sheet
+    split: Literal["default", "full"] = "default"  # how the shapes are divided (A.4, Table 2)
+    pool: Literal["train", "valid", "test"] = "test"  # part of the split that is on offer
+    num_available: int = NUM_AVAILABLE  # shapes on offer in an episode (Table 3)
+    placement: Literal["none", "1d", "2d"] = "1d"  # where the agent may drop shapes (C.6)
 
 
 def main(args: Args) -> None:
     """The script: see the top of the file."""
-    split, labels = split_actions(args.split, args.seed), action_labels()
-    env = StackingEnv(split[args.pool], args.num_available, "rgb_array", placement=args.placement)
+    parts, labels = split_actions(args.split, args.seed), action_labels()
+    env = StackingEnv(parts[args.pool], args.num_available, "rgb_array", placement=args.placement)
     print(f"{NUM_ACTIONS} shapes; {args.split} split {args.seed}, {args.num_available} on offer:")
-    print("  " + " ".join(f"{name:>8}" for name in ("all", *split)) + "  class")
+    print("".join(f"{name:>8}" for name in parts) + "  class")
     for label in np.unique(labels):
-        counts = [
-            (labels == label).sum(),
-            *((labels[ids] == label).sum() for ids in split.values()),
-        ]
-        print("  " + " ".join(f"{count:8}" for count in counts) + f"  {label}")
+        print("".join(f"{(labels[ids] == label).sum():8}" for ids in parts.values()) + f"  {label}")
     for policy in ("greedy", "random"):
         height, frames = play(env, args.seed, policy)
         path = args.out / f"stacking_{policy}.gif"
