@@ -24,7 +24,6 @@ from stacking_env import FAMILIES, SHAPES, Bullet, StackingEnv, action_observati
 ROOT = Path(__file__).parent.parent
 IDS = {family.name: [i for i, s in enumerate(SHAPES) if s.family is family] for family in FAMILIES}
 LARGEST = {name: ids[-1] for name, ids in IDS.items()}
-FAMILY = {family.name: family for family in FAMILIES}
 
 
 def act(choice=0, x=0.0, stop=0):
@@ -102,7 +101,7 @@ def test_scales_and_angles_of_a_family(name, low, high, turn):
     ("capsule", (0, 0), (0.46, 1.21, 1.21)), ("cylinder", (0, 0), (0.5, 7 / 12, 7 / 12)),
 ])  # fmt: skip
 def test_mass_properties_are_the_published_ones(name, com, moments):
-    centre, _, ours = stacking_env.mass_properties(FAMILY[name])
+    centre, _, ours = stacking_env.mass_properties(SHAPES[LARGEST[name]].family)
     assert np.allclose(centre[[0, 2]], com, atol=0.003) and abs(centre[1]) < 1e-9
     assert moments is None or np.allclose(sorted(ours), moments, atol=0.003)
 
@@ -110,9 +109,7 @@ def test_mass_properties_are_the_published_ones(name, com, moments):
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
 def test_mass_properties_equal_random_sampling(family):
     com, axes, moments = stacking_env.mass_properties(family)
-    points = np.random.default_rng(0).uniform(
-        family.points.min(0), family.points.max(0), (80_000, 3)
-    )
+    points = np.random.default_rng(0).uniform(-2, 2, (200_000, 3))
     points = axes.inv().apply(points[inside(family, points)] - com)  # in the body's frame
     assert np.allclose(points.mean(0), 0, atol=0.02)
     covariance = points.T @ points / len(points)
@@ -213,16 +210,6 @@ def test_a_face_is_as_bright_as_it_is_turned_to_the_light():
     assert np.linalg.norm(stacking_env.LIGHT) == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.parametrize("order", [(-1.0, 1.0), (1.0, -1.0)])
-def test_the_nearer_body_is_seen_whatever_the_order(order):
-    bullet = Bullet()
-    for y in order:
-        rgb = (1, 0, 0) if y < 0 else (0, 1, 0)
-        stacking_env.add_shape(bullet, LARGEST["cube"], (0, y, 0), rgb)
-    red, green, _ = stacking_env.photograph(bullet, ((0, -5, 0), (0, 0, 0)))[42, 42]
-    assert red > 100 and green == 0
-
-
 def test_the_state_shows_the_right_side_and_the_published_scale(env):
     before = env.reset(seed=2)[0]["state"][3].astype(int)
     after = env.step(act(0, 1.0))[0]["state"][3].astype(int)
@@ -243,15 +230,6 @@ def test_views_repeat_for_any_workers_order_and_number():
     assert np.array_equal(one, action_observations(ids, 6, "image", seed=2, workers=3))
     assert np.array_equal(one[1:2, :4], action_observations([3], 4, "image", seed=2))
     assert not np.array_equal(one, action_observations(ids, 6, "image", seed=3))
-
-
-def test_every_shape_is_seen_from_all_around():
-    views = action_observations(np.arange(0, 810, 9), 8)
-    covered = (views > 0).mean((2, 3))
-    assert covered.min() > 0.002 and covered.max() < 0.8
-    assert len({view.tobytes() for view in views.reshape(-1, 84 * 84)}) > 0.9 * len(views) * 8
-    small, large = action_observations([IDS["cube"][0], IDS["cube"][-1]], 32)
-    assert (large > 0).mean() > 20 * (small > 0).mean()  # scale 6 times, area up to 36 times
 
 
 def test_viewpoints_lie_on_the_published_circles(monkeypatch):
@@ -309,16 +287,13 @@ def test_bullet_has_mass_1_the_true_inertia_and_the_centre_of_mass(name):
     assert np.allclose(body, (upright * axes).as_matrix(), atol=1e-6)
 
 
-def mean_height(policy, episodes):
-    env = StackingEnv()
+@pytest.mark.parametrize("policy, episodes, low, high", [
+    ("random", 16, 1.2, 2.1),  # 1.63 expected; standard error .12
+    ("greedy", 10, 4.0, 6.6),  # 5.39 on the published scales, 4.9 on these; standard error .4
+])  # fmt: skip
+def test_play_reaches_the_expected_height(env, policy, episodes, low, high):
     heights = [stacking_env.play(env, seed, policy)[0] for seed in range(episodes)]
-    env.close()
-    return np.mean(heights)
-
-
-def test_random_play_and_a_flat_tower_reach_the_expected_heights():
-    assert 1.2 < mean_height("random", 16) < 2.1  # 1.63; standard error .12
-    assert 4.0 < mean_height("greedy", 10) < 6.6  # 4.9 with these scales; standard error .4
+    assert low < np.mean(heights) < high
 
 
 def test_one_seed_builds_one_tower_bit_for_bit_whatever_came_before(env):
@@ -326,28 +301,16 @@ def test_one_seed_builds_one_tower_bit_for_bit_whatever_came_before(env):
         height, _ = stacking_env.play(env, seed, "random")
         return height, *(part.tobytes() for part in env.poses())
 
-    first = [tower(env, seed) for seed in range(2)]
+    first = tower(env, 1)
     for seed in range(100, 150):  # other episodes, of one drop each
         env.reset(seed=seed)
         env.step(act(seed % 20, 0.4))
-    assert [tower(env, seed) for seed in range(2)] == first
     fresh = StackingEnv()
-    assert tower(fresh, 1) == first[1]
+    assert tower(env, 1) == tower(fresh, 1) == first
     fresh.close()
 
 
-def test_a_shape_that_enters_the_table_is_waited_for():
-    """This thin one hits the table at 3.5 m/s and is met 0.05 inside it, slow already."""
-    env = StackingEnv(np.arange(810))
-    env.reset(seed=4600)
-    env.step(act(0, 0.0))
-    thin = SHAPES[env.shape_ids[-1]]
-    assert thin.scale == pytest.approx(0.08)
-    assert env.poses()[0][-1, 2] > 0.4 * thin.scale  # lying flat: 0.5
-    env.close()
-
-
-@example(4600, [(0, 0.0)])
+@example(4600, [(0, 0.0)])  # thin, hits the table at 3.5 m/s and is met .05 inside it, slow already
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 2**31), st.lists(st.tuples(st.integers(0, 19), st.floats(-1, 1, width=32)),
                                        min_size=1, max_size=10))  # fmt: skip
@@ -509,15 +472,6 @@ def test_the_example_in_the_docstring_runs_to_the_tenth_step():
     assert len(example.examples) == 3
     assert doctest.DocTestRunner().run(example, clear_globs=False).failed == 0
     assert example.globs["env"]._steps == 10 and example.globs["info"]["height"] > 0.3
-    env, steps = StackingEnv(), []
-    env.action_space.seed(0)
-    for _ in range(60):
-        env.reset()
-        while not any(env.step(env.action_space.sample())[2:4]):
-            pass
-        steps.append(env._steps)
-    assert 1.4 < np.mean(steps) < 2.4  # "1.7 steps on average"; 2 are expected
-    env.close()
 
 
 def test_processes_play_the_same_episodes_as_single_environments():
@@ -543,18 +497,14 @@ def test_processes_play_the_same_episodes_as_single_environments():
     envs.close()
 
 
-def test_render_frames_show_the_fall_and_cost_nothing_without_render_mode(env):
+def test_watching_shows_the_fall_and_changes_nothing(env):
     watched = StackingEnv(render_mode="rgb_array")
     for each in (watched, env):
         each.reset(seed=3)
         each.step(act(1, 0.8))
     frames = watched.render_frames()
-    assert len(frames) >= 3 and all(f.shape == (336, 336, 3) for f in frames)
-    assert not np.array_equal(frames[0], frames[-1]) and np.array_equal(
-        frames[-1], watched.render()
-    )
-    assert env.render_frames() == [] and env.render() is None
-    assert np.array_equal(watched.poses()[0], env.poses()[0])  # watching changes nothing
+    assert len(frames) >= 3 and not np.array_equal(frames[0], frames[-1])
+    assert np.array_equal(watched.poses()[0], env.poses()[0])
     watched.close()
 
 
