@@ -543,6 +543,7 @@ class StackingEnv(gym.Env):
         self.action_space = spaces.Dict(parts)
         # The simulation is made in the first reset, so in the worker process of a vector env.
         self._bullet: Bullet | None = None
+        self._frames: list[np.ndarray] = []  # colour pictures of the last reset or step
 
     def __reduce__(self) -> None:
         raise TypeError("a StackingEnv holds a running simulation: make a new one, do not copy it")
