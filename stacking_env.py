@@ -828,10 +828,11 @@ def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, li
     left = float(np.clip(env.poses()[0][0, 0], -1, 1))  # greedy: all over the left cylinder
     size, info, frames = PLACEMENTS[env.placement], {}, []
     for step in itertools.count():
-        # (4, 84, 84) -> (2 x 84, 2 x 84), the newest last, then each pixel as 2 x 2 in grey
-        grid = obs["state"].reshape(2, 2, SIZE, SIZE).swapaxes(1, 2).reshape(2 * SIZE, 2 * SIZE)
-        seen = grid.repeat(2, axis=0).repeat(2, axis=1)[..., None].repeat(3, axis=2)
-        frames += [np.concatenate([frame, seen], axis=1) for frame in env.render_frames()]
+        for frame in env.render_frames():
+            # (4, 84, 84) -> (2 x 84, 2 x 84), the newest last, then each pixel as 2 x 2 in grey
+            grid = obs["state"].reshape(2, 2, SIZE, SIZE).swapaxes(1, 2).reshape(2 * SIZE, 2 * SIZE)
+            seen = grid.repeat(2, axis=0).repeat(2, axis=1)[..., None].repeat(3, axis=2)
+            frames.append(np.concatenate([frame, seen], axis=1))
         if info:
             return info[METRIC], frames
         if policy == "greedy":
