@@ -98,11 +98,10 @@ def engineered_representations(variant: str = "12d") -> np.ndarray:
     # score was reached with it and move ids have no order. A network cannot tell our signs apart.
     deltas = MOVE_DELTAS[SKILL_MOVES]  # (1024, 5, 2)
     tables = {
-        "12d": np.column_stack([deltas.sum(1), deltas.reshape(NUM_ACTIONS, 10)]),
+        "12d": np.column_stack([deltas.sum(1), deltas.reshape(-1, 10)]),
         "5d": SKILL_MOVES * 2 / 3 - 1,
-        "path": deltas.cumsum(1).reshape(
-            NUM_ACTIONS, 10
-        ),  # ours: alike if they pass the same cells
+        # ours: skills are alike if they pass the same cells
+        "path": deltas.cumsum(1).reshape(-1, 10),
     }
     if variant not in tables:
         raise ValueError(f"variant {variant!r} is unknown; there are {', '.join(tables)}")
@@ -145,21 +144,21 @@ LAYOUTS[..., 7, 7] = GOAL  # A.1: bottom right corner
 for i, j in np.ndindex(len(RIVERS), len(OPENINGS)):
     LAYOUTS[0, i, j, RIVERS[i], 1:-1] = LAVA  # a column: one x, all y
     LAYOUTS[0, i, j, RIVERS[i], OPENINGS[j]] = SUBGOAL
-LAYOUTS[1] = LAYOUTS[0].swapaxes(2, 3)  # the same as rows; the goal is on the diagonal and stays
+LAYOUTS[1] = LAYOUTS[0].swapaxes(2, 3)  # the same as rows
 LAYOUTS = LAYOUTS.reshape(-1, SIZE * SIZE)  # (42, 81): cell (x, y) at index x * 9 + y
 
 
 def walk(grid: list[int], cell: int, skill: int) -> list[int]:
-    """The cells the agent stands on after each move of `skill`; fewer than five if it ends early.
+    """The cells after each move of `skill`; fewer than five if the episode ends.
 
     Moves are absolute. E.g. UUURD from (3, 2), cell 29: 28, 28, 28, 37, 38 (two bumps).
     """
     cells = []
     for step in SKILL_STEPS[skill]:
-        if grid[cell + step] != WALL:  # A.1: at the wall it stays, a null move; it counts as one
+        if grid[cell + step] != WALL:  # A.1: a null move, it counts as one
             cell += step
         cells.append(cell)
-        if grid[cell] in (GOAL, LAVA):  # A.1 ends the game on lava; published code: goal as well
+        if grid[cell] in (GOAL, LAVA):  # A.1: lava; published code: also the goal
             break
     return cells
 
@@ -322,7 +321,7 @@ def action_observations(action_ids, num_observations=1024, modality="xy", seed=0
 
 # ---- pictures for people (Figure 1) ----
 
-CELL = 160  # ours: drawn 4 times larger than shown, then averaged down, so that edges are smooth
+CELL = 160  # ours: drawn 4 times larger, then averaged down: smooth edges
 COLORS = {EMPTY: "#17191d", WALL: "#6f7378", GOAL: "#35b44a",
           LAVA: "#f5821f", SUBGOAL: "#2f6fe4", AGENT: "#ee2b2b"}  # fmt: skip
 LINE, TRAIL, KEY, TEXT, DIM, WAVE = "#3c4046", "#8f2c2c", "#2a2d33", "#f2f2f2", "#80858c", "#a94a06"
@@ -414,7 +413,7 @@ def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None
 
 
 def best_plan(layout: int, available: Sequence[int]) -> list[int]:
-    """Positions in `available` whose skills reach the goal in the fewest moves; [] if none do."""
+    """Positions in `available` that reach the goal in the fewest moves; [] if none do."""
     grid, seen = LAYOUTS[layout].tolist(), set()
     queue = [(0, START, [])]  # (moves made, cell, plan), the fewest moves first: Dijkstra
     while queue:

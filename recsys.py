@@ -48,7 +48,7 @@ from PIL import Image
 NUM_ACTIONS = 10_000  # A.2 "a total of 10,000 actions (products)"
 DIM = 16  # A.2, Table 3: size of the user vector and of a product vector
 METRIC = "ctr"  # A.2: click-through rate, clicks / recommendations of one episode
-MODALITIES: tuple[str, ...] = ()  # A.2: engineered representations only, nothing to observe
+MODALITIES: tuple[str, ...] = ()  # A.2: nothing to observe
 NUM_AVAILABLE = 500  # Table 3 "actions per episode"
 MAX_RECOMMENDATIONS = 100  # A.2, Table 3 "max. episode length"
 EQ_2 = (14.0, 2.0, 0.3, 2.0, 6.0)  # a, b, c, d, e of Eq. 2; this c is not a product
@@ -81,7 +81,7 @@ def action_labels() -> np.ndarray:
 def engineered_representations(fully_observable: bool = False) -> np.ndarray:
     """What the policy may know about each product, float32.
 
-    (10_000, 16): the vectors c_i (A.2). With `fully_observable` (10_000, 17): mu_i is added (C.5).
+    (10_000, 16): the vectors c_i (A.2). `fully_observable`, (10_000, 17): mu_i is added (C.5).
     """
     if not fully_observable:
         return PRODUCTS.astype(np.float32)
@@ -91,7 +91,7 @@ def engineered_representations(fully_observable: bool = False) -> np.ndarray:
 
 
 def action_observations(action_ids, num_observations, modality, seed=0, workers=1) -> np.ndarray:
-    """ValueError: products come with engineered vectors, nobody observes them (A.2)."""
+    """ValueError: products come with engineered vectors (A.2)."""
     raise ValueError("recsys has no action observations; use engineered_representations()")
 
 
@@ -167,7 +167,7 @@ class RecSysEnv(gym.Env):
     click), `truncated` after 100. The last info holds `ctr`: clicks / recommendations.
 
     ## Arguments
-    `action_pool`: distinct ids (n,) that `available` is drawn from (default: training products).
+    `action_pool`: distinct ids that `available` is drawn from (default: training).
     `num_available`: K (default 500, Table 3). `render_mode`: None or "rgb_array".
     ValueError for unknown or repeated ids, fewer than K of them, or K < 1.
     """
@@ -192,7 +192,7 @@ class RecSysEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """A new user, who looks around alone first; returns (observation, {})."""
-        super().reset(seed=None if seed is None else operator.index(seed))  # numpy integers, too
+        super().reset(seed=None if seed is None else operator.index(seed))  # numpy, too
         offer = self.np_random.choice(self.action_pool, self.num_available, replace=False)
         self.available = np.sort(offer)  # with the whole pool on offer a position is a product
         self.user = self.np_random.standard_normal(DIM)
@@ -431,7 +431,7 @@ class Args:
     policy: Literal["random", "c-only", "mu-only", "oracle"] = "c-only"  # who recommends
     pool: Literal["train", "valid", "test"] = "test"  # products to draw from
     num_available: int = NUM_AVAILABLE  # products on offer in the episode (Table 3)
-    seed: int = 5  # seed of the user and of the products on offer; ours: 5 is a typical user
+    seed: int = 5  # ours: 5 draws a typical user
     episodes: int = 200  # episodes per entry of the table of floors and ceilings
     out: Path = Path("runs/demo")  # folder for the pictures
 
