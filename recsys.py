@@ -141,7 +141,7 @@ class RecSysEnv(gym.Env):
     The user is a vector v of 16 numbers and is in an organic session (looks around alone), in a
     bandit session (is shown a recommendation), or gone; see TRANSITIONS. Every draw of the next
     session, also one that changes nothing, perturbs the user: v + 0.1 |z| n with a scalar
-    z ~ N(0, 1) and n ~ N(0, I). A click overrides the draw: the user goes organic, even if the draw
+    z ~ N(0, 1) and n ~ N(0, I). A click overrides it: the user goes organic, even if the draw
     said gone. Product i is clicked with probability f(c_i . v + mu_i) (Eq. 2), c_i of length 1,
     mu_i ~ N(0, 3^2): popularity outweighs taste, and c_i does not tell it.
 
@@ -197,7 +197,7 @@ class RecSysEnv(gym.Env):
         self.available = np.sort(offer)  # with the whole pool on offer a position is a product
         self.user = self.np_random.standard_normal(DIM)
         self.recommendations = self.clicks = 0
-        self.timeline = []  # what happened, for pictures: (user, product or PAGE_VIEW, click)
+        self.timeline = []  # for pictures: (user, product or PAGE_VIEW, click)
         self.ending = ""
         # appendix: silent; published code: does not notice a user who leaves in this first session
         # (1 in 26). One recommendation is still made, and a click brings the user back. We keep
@@ -263,7 +263,7 @@ class RecSysEnv(gym.Env):
         return {"state": self.user.astype(np.float32), "available": self.available.copy()}
 
     def render(self) -> np.ndarray | None:
-        """The episode so far in a picture: uint8 (480, 900, 3); None without a render_mode."""
+        """The episode so far: uint8 (480, 900, 3); None without a render_mode."""
         if self.ending == "not started":
             raise gym.error.ResetNeeded("call reset() before render()")
         if self.render_mode == "rgb_array":
@@ -345,7 +345,7 @@ def episode_text(env: RecSysEnv) -> str:
 
 def draw_timeline(available: np.ndarray, timeline: list, ending: str = "") -> np.ndarray:
     """An episode from left to right (`RecSysEnv.timeline`): uint8 (480, 900, 3)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # here: training draws nothing
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     users, products, clicked = map(np.array, zip(*timeline, strict=True))  # (T, 16), 2 x (T,)
