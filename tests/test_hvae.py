@@ -21,13 +21,11 @@ HELD_OUT = np.setdiff1d(np.arange(1024), TRAIN)
 SHAPES = {"xy": (6, 2), "onehot": (6, 2), "video": (3, 48, 48), "image": (84, 84)}
 
 
-def arguments(modality="xy", recipe="laptop", **changes):
-    """Args with Grid World's numbers, also for what Grid World has not."""
+def arguments(modality="xy", recipe="laptop", **changes):  # Grid World's numbers
     return replace(default_args("gridworld", recipe), modality=modality, **changes)
 
 
-def small(modality, model=HVAE):
-    """A model and raw observations (3 actions, 2 of each, ...)."""
+def small(modality, model=HVAE):  # and raw observations: 3 actions, 2 of each
     torch.manual_seed(0)
     if modality in ("xy", "onehot"):
         raw = gridworld.action_observations(TRAIN[:3], 2, modality, 0, 1)
@@ -199,7 +197,6 @@ def test_short_training_learns_unseen_skills_and_never_sees_them(tmp_path, monke
     record = json.loads(path.with_suffix(".json").read_text())
     assert record["scores"]["net_r2"] > 0.7 and record["scores"]["move_accuracy"] > 0.35
     assert record["published"] == dict(net_r2=0.946, move_accuracy=0.604, nn_net_match=0.717)
-    assert path.with_suffix(".csv").read_text().startswith("loss,rec,kl_z,kl_c,error\n")
     # The weights reproduce the table, from all observations and from halves of them.
     model, table = HVAE(args, (6, 2)), hvae.load_representation(path, "gridworld")
     model.load_state_dict(torch.load(path.with_suffix(".pt"), weights_only=True))
@@ -236,7 +233,6 @@ def test_oracle_encoder_and_plain_vae_train_on_what_they_say(tmp_path):
 @pytest.mark.parametrize("env, modality", [("create", "xy"), ("create", "state"),
                                            ("create", "video"), ("stacking", "image")])  # fmt: skip
 def test_every_modality_trains_and_embeds(env, modality):
-    """Real observations of four actions: one update, one table."""
     args = replace(default_args(env, modality=modality), updates=1, batch_observations=2)
     module, ids = hvae.load_environment(env), np.array([1, 2, 5, 7])
     data = module.action_observations(ids, 2, modality, 0, 1)
@@ -298,9 +294,8 @@ def test_only_the_recipes_own_table_has_its_name():
     ("unknown modality 'smell'; allowed: xy, onehot", dict(modality="smell")),
     ("unknown recipe 'slow'", dict(recipe="slow")), ("odd", dict(split="odd")),
     ("device 'tpu' is not available", dict(device="tpu")), ("even", dict(hidden=63)),
-    ("batch_size must be at least 1, got 0", dict(batch_size=0)),
+    ("batch_size must be at least 1", dict(batch_size=0)), ("no effect", dict(epochs=5)),
     ("batch_observations are more than", dict(observations=3)),
-    ("epochs has no effect", dict(epochs=5)),
     ("q_hidden has no effect", dict(hierarchical=False, q_hidden=7)),
 ])  # fmt: skip
 def test_bad_choices_are_refused_before_anything_is_written(tmp_path, words, changes):
@@ -316,9 +311,8 @@ def test_probe_of_ground_truth_and_of_noise():
     scores = hvae.probe(noise, TRAIN, HELD_OUT)
     assert scores["net_r2"] < 0.05 and 0.2 < scores["move_accuracy"] < 0.3
     assert scores["nn_net_match"] < 0.1 and abs(scores["nn_class"] - scores["chance_class"]) < 0.06
-    moves = np.arange(1024)[:, None] // 4 ** np.arange(5) % 4
-    net = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])[moves].sum(1).astype(float)
-    scores = hvae.probe(net, TRAIN, HELD_OUT)
+    path = gridworld.action_observations(np.arange(1024), 99, "xy", 0, 1).astype(float)
+    scores = hvae.probe(np.median(path[:, :, 5] - path[:, :, 0], 1), TRAIN, HELD_OUT)  # net
     assert scores["nn_net_match"] > 0.98 and scores["nn_class"] > 0.9
     # 2 from the nearest training skill, 0.5 between the halves
     table = np.zeros((1024, 16))
@@ -329,7 +323,6 @@ def test_probe_of_ground_truth_and_of_noise():
 
 
 def saved(folder, **changes):
-    """A valid file, with some of its arguments changed."""
     config = dict(env="gridworld", split="default", split_seed=0, train_on="train")
     table = dict(mean=np.ones((1024, 16)), action_ids=TRAIN, config=config)
     return hvae.save_representation(folder / "table.npz", **table | changes)
@@ -390,14 +383,11 @@ def test_command_line_makes_every_file_or_one_line_of_error(tmp_path, capsys):
     done = run("gridworld", "--updates", 5, "--observations", 8)
     assert done.returncode == 0 and not done.stderr, done.stderr  # no progress bar in a pipe
     assert "'net_r2': 0.946" in done.stdout and done.stdout.count("\n") == 2  # scores, path
-    assert {p.suffix for p in (tmp_path / "hvae").iterdir()} == set(
-        ".npz .pt .csv .json .png".split()
-    )
+    assert len({p.suffix for p in (tmp_path / "hvae").iterdir()}) == 5  # .npz .pt .csv .json .png
     with pytest.raises(SystemExit):
         hvae.parse_args(["create", "--recipe", "quick", "--help"])
     text = capsys.readouterr().out  # the numbers of this environment and recipe
-    for words in ("Table 3", "Table 4", "--no-hierarchical", "(default: 1250)", "(default: 128)"):
-        assert words in text and "None" not in text
+    assert "(default: 1250)" in text and "(default: 128)" in text and "None" not in text
 
 
 @pytest.mark.slow
