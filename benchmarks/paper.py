@@ -1,21 +1,17 @@
 """Every figure and analysis of the appendix as commands: print them, or run what is missing.
 
-    python benchmarks/paper.py all --dry-run                # every command, ready to be pasted
-    python benchmarks/paper.py gridworld --jobs 2           # run them, two at a time
-    python benchmarks/paper.py create-push --only ours nearest_neighbor --seeds 0 --budget 0.1
-    python benchmarks/paper.py gridworld --recipe paper     # Tables 3 and 4 to the letter
+    python benchmarks/paper.py all --dry-run               # every command, ready to be pasted
+    python benchmarks/paper.py gridworld --jobs 2          # run them, two at a time
+    python benchmarks/paper.py fig10 --only push --seeds 0 --budget 0.1
+    python benchmarks/paper.py gridworld --recipe paper    # Tables 3 and 4 to the letter
 
 TABLE is the whole matrix: figure -> row -> command. A command's first word says what it is: an
 environment (a training), `evaluate` (a test of a finished training) or `hvae` (an encoder). {row}
-in a command is the folder of another row of the same figure, {figure/row} that of another
-figure's; these come along. What is finished is not run again, what was killed goes on from its
-checkpoint, and rows of several figures that are the same run share it. Every score goes to
-
-    results/<figure>.csv           one row per run and phase, with its command
-    results/<figure>_curves.csv    learning curves, at most 50 points a run
-
-and benchmarks/report.py draws them. With --recipe paper the files are <figure>-paper.csv and
-<figure>-paper_curves.csv: two recipes never share a table.
+in a command is the folder of another row, {figure/row} that of another figure's; these come along.
+What is finished is not run again, what was killed goes on from its checkpoint, and rows of several
+figures that are the same run share it. Scores go to results/<figure>.csv, one row per run and
+phase, learning curves to results/<figure>_curves.csv; with --recipe paper to <figure>-paper.csv,
+since two recipes never share a table. benchmarks/report.py draws them.
 """
 
 import csv
@@ -34,7 +30,6 @@ from pathlib import Path
 from threading import Lock
 from typing import Literal
 
-import numpy as np
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -95,11 +90,13 @@ def vary(flag: str, *values) -> dict[str, str]:
 
 
 TABLE = {
-    "quick": rows("gridworld --quick", {"gridworld/ours": ""})  # the README's first commands
-    | rows("gridworld --quick", {"gridworld/engineered": "--representation engineered"})
-    | rows("recsys --quick", {"recsys/ours_bilinear": "--bilinear"})
-    | rows("create --quick", {"create/ours": ""})
-    | rows("stacking --quick", {"stacking/ours": ""}),
+    "quick": {  # the README's first commands
+        "gridworld/ours": "gridworld --quick",
+        "gridworld/engineered": "gridworld --quick --representation engineered",
+        "recsys/ours_bilinear": "recsys --quick --bilinear",
+        "create/ours": "create --quick",
+        "stacking/ours": "stacking --quick",
+    },
     "gridworld": rows("gridworld", METHODS | ENGINEERED | ONE_HOT),
     "recsys": rows("recsys", RECSYS),
     "create-push": rows("create --task push", METHODS | VIDEO),
@@ -113,9 +110,9 @@ TABLE = {
     "fig9": {},  # below
     "fig10": rows("create --task TASK", SUBGOAL, CREATE),
     "fig11": rows("create --task TASK", AUXILIARY, CREATE),
-    # C.5. Published code: tested with 25 products on offer; as all other runs: 500 (Table 3).
+    # C.5. Runs are tested with 500 products on offer (Table 3); published code: with 25.
     "fig12": rows("recsys --fully-observable", RECSYS)
-    | rows("evaluate {ours}", vary("num-available", 25, 500)),
+    | rows("evaluate {ours}", vary("num-available", 25)),
     "fig13": rows("stacking", PLACEMENT | FULL_SPLIT),  # C.6
     "table1": rows("create --task TASK", {"ours": ""} | FULL_SPLIT, CREATE),
     "analysis": rows("create --task TASK", ANALYSIS, CREATE),
@@ -155,7 +152,6 @@ class Args:
     seeds: tuple[int, ...] = (0, 1, 2)  # published: 5 seeds, 8 in Grid World
     recipe: Literal["fast", "paper"] = "fast"  # of policies; paper: of Figures 4-6's encoders, too
     budget: float = 1.0  # factor on the recipe's number of environment steps
-    steps: int | None = None  # or that number itself
     extra: str = ""  # more flags for every training, as in --extra="--eval-episodes 1000"
     jobs: int = 1  # commands at a time
     dry_run: bool = False  # only print the commands
@@ -185,13 +181,6 @@ class Job:
         return f"python {script} {shlex.join(self.words)}"
 
 
-def parse(words: list[str]) -> ppo_actiongen.Args:
-    """A training's command line as ppo_actiongen.py reads it."""
-    recipe = words[words.index("--recipe") + 1] if "--recipe" in words else "fast"
-    default = ppo_actiongen.default_args(words[0], recipe, "--quick" in words)
-    return tyro.cli(ppo_actiongen.Args, args=words[1:], default=default)
-
-
 @cache  # what several rows need is one job
 def expand(figure: str, row: str, seed: int, args: Args) -> Job:
     """The job of one row and seed."""
@@ -214,14 +203,15 @@ def expand(figure: str, row: str, seed: int, args: Args) -> Job:
     words += ["--runs-dir", args.runs_dir] if args.runs_dir != "runs" else []
     if kind == "hvae":  # one encoder seed for all policies, as published
         encoder = hvae.parse_args(words)
-        path = Path(hvae.representation_path(encoder))
+        path = hvae.representation_path(encoder)
         return Job(figure, row, seed, kind, words, encoder, path, needs)
-    if args.steps or args.budget != 1:
-        steps = args.steps or round(args.budget * parse(words).total_timesteps)
-        words += ["--total-timesteps", str(steps)]
+    if args.budget != 1:
+        usual = ppo_actiongen.parse_args(words).total_timesteps
+        words += ["--total-timesteps", str(round(args.budget * usual))]
     words += shlex.split(args.extra)
-    folder = Path(ppo_actiongen.run_path(parse(words)))
-    return Job(figure, row, seed, "train", words, parse(words), folder, needs)
+    training = ppo_actiongen.parse_args(words)
+    path = ppo_actiongen.run_path(training)
+    return Job(figure, row, seed, "train", words, training, path, needs)
 
 
 def plan(args: Args) -> list[Job]:
@@ -229,9 +219,6 @@ def plan(args: Args) -> list[Job]:
     figures = tuple(TABLE) if args.figures == ("all",) else args.figures
     if unknown := set(figures) - set(TABLE):
         raise ValueError(f"figure {min(unknown)!r} is not one of {', '.join(TABLE)}, all")
-    parts = {row: {row, *row.split("/")} for figure in figures for row in TABLE[figure]}
-    if unknown := set(args.only) - set().union(*parts.values()):
-        raise ValueError(f"row {min(unknown)!r} is not one of {', '.join(parts)}")
     jobs: dict[tuple, Job] = {}
 
     def add(job: Job) -> None:
@@ -240,9 +227,12 @@ def plan(args: Args) -> list[Job]:
         jobs.setdefault((job.figure, job.row, job.command), job)  # encoders: once for all seeds
 
     for seed in args.seeds:  # seed by seed, so that an interrupted matrix is balanced
-        for figure, row in [(figure, row) for figure in figures for row in TABLE[figure]]:
-            if not args.only or parts[row] & set(args.only):
-                add(expand(figure, row, seed, args))
+        for figure in figures:
+            for row in TABLE[figure]:
+                if not args.only or {row, *row.split("/")} & set(args.only):
+                    add(expand(figure, row, seed, args))
+    if not jobs:
+        raise ValueError(f"no row is called {' or '.join(args.only)}: see --dry-run")
     return list(jobs.values())
 
 
@@ -263,7 +253,7 @@ def machine() -> str:
     name = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():  # Linux: platform knows no more than "x86_64"
         name = re.search(r"model name\s*: (.+)|$", Path("/proc/cpuinfo").read_text())[1] or name
-    return f"{name}, {os.environ.get('OMP_NUM_THREADS', '?')} thread(s)"
+    return f"{name}, {os.environ.get('OMP_NUM_THREADS', 1)} thread(s)"  # 1: as the scripts do
 
 
 def score_rows(job: Job) -> list[dict]:
@@ -293,10 +283,7 @@ def score_rows(job: Job) -> list[dict]:
     made = json.loads((job.folder / "args.json").read_text())
     for name in wanted.keys() - {"resume", "device", "runs_dir", "run_name"}:
         if made.get(name, "missing") != wanted[name]:
-            raise ValueError(
-                f"{job.folder} was made with {name} {made.get(name, 'missing')!r}, row {job.row} "
-                f"of {job.figure} has {wanted[name]!r}: move it away, or take another --runs-dir"
-            )
+            raise ValueError(f"{job.folder} holds a run with another {name}: move it away")
     found = json.loads((job.folder / "results.json").read_text())
     row |= {"steps": found["steps"], "hours": found["hours"]}
     # A policy that adapts has one set of actions, and one phase.
@@ -304,14 +291,13 @@ def score_rows(job: Job) -> list[dict]:
 
 
 def curve_rows(job: Job) -> list[dict]:
-    """A training's learning curve, not held at its maximum; of many points means of neighbours."""
+    """A training's learning curve: at most 50 points, raw (published ones keep their maximum)."""
     # A policy that adapts is trained on what it is tested on: its own episodes are the curve.
-    names = CURVES[-1:] if job.args.adapt or job.args.finetune else CURVES[-3:-1]
+    names = CURVES[-1:] if job.args.adapt else CURVES[-3:-1]
     points = [point for point in read(job.folder / "metrics.csv") if point[names[0]]]
-    parts = np.array_split(points, min(50, len(points))) if points else []
-    means = [{n: np.mean([float(p[n]) for p in part]) for n in names} for part in parts]
-    same = score_rows(job)[0]
-    return [same | m | {"step": p[-1]["step"]} for m, p in zip(means, parts, strict=True)]
+    points = points[:: -(len(points) // 50 + 1)][::-1]  # with the last one
+    same = {k: v for k, v in score_rows(job)[0].items() if k in CURVES}
+    return [same | {name: point[name] for name in ("step", *names)} for point in points]
 
 
 def merge(path: Path, columns: list[str], key: list[str], rows: list[dict]) -> None:
@@ -346,7 +332,7 @@ def run(job: Job, needs: list[Future], args: Args) -> bool:
     with LOCKS[job.folder]:
         if ready and not score_rows(job):
             _, *words = shlex.split(job.command)
-            words += ["--resume"] * (job.kind == "train" and job.folder.exists())
+            words += ["--resume"] * (job.folder / "args.json").exists()
             log.parent.mkdir(parents=True, exist_ok=True)
             with log.open("a") as file:
                 subprocess.run([sys.executable, *words], stdout=file, stderr=subprocess.STDOUT)
@@ -371,8 +357,6 @@ def main(args: Args) -> None:
     if args.dry_run:
         print("\n".join(dict.fromkeys(job.command for job in jobs)))
         return
-    # Threads that share a core wait for each other, so a job has only its part of the cores.
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // args.jobs)))
     left = sum(not score_rows(job) for job in jobs)  # a folder of another run is an error now
     print(f"{left} of {len(jobs)} commands to run", flush=True)
     futures: dict[Job, Future] = {}

@@ -10,7 +10,6 @@ Each environment is shown at one number of steps, the one most rows of the figur
 within two standard errors of random play are not in the table, but in one line below it.
 """
 
-import importlib
 import io
 import os
 import re
@@ -26,7 +25,7 @@ import tyro
 os.environ["MPLBACKEND"] = "agg"  # an inherited one may not exist here, and ends the import
 sys.path.insert(0, str(Path(__file__).parent))
 import paper  # noqa: E402
-from paper import ROOT, TABLE, ppo_actiongen, read  # noqa: E402
+from paper import ROOT, TABLE, hvae, ppo_actiongen, read  # noqa: E402
 
 METHODS = {  # name -> label and colour, the same in every table and picture, in this order
     "ours": ("Ours", "#0b5394"),
@@ -53,7 +52,7 @@ METHODS = {  # name -> label and colour, the same in every table and picture, in
 ENVIRONMENTS = {  # title, what a score is
     "gridworld": ("Grid World", "success rate"),
     "recsys": ("Recommender", "click-through rate"),
-    "recsys_full": ("Recommender, fully observable", "click-through rate"),
+    "recsys_full": ("Full Recommender", "click-through rate"),
     "create": ("CREATE", "success rate"),
     "stacking": ("Shape Stacking", "height"),
 }
@@ -126,23 +125,23 @@ def steps(place: Place) -> str:
 
 @cache
 def all_published() -> dict[tuple, tuple[float, float]]:
-    """Both files of published scores: a row's key -> mean and standard deviation."""
+    """Mean and standard deviation by the columns that name a row of the two published files."""
     found = {}
-    for row in read(ROOT / "results/published_results.csv"):
-        key = row["env"], row["task"], row["method"], row["phase"]
-        found[key] = float(row["mean"]), float(row["std"])
-    for row in read(ROOT / "results/published_analyses.csv"):
-        # Distances 0.5 .. 5 of another table of representations: by rank, as our quantiles 0 .. 0.9
-        x = float(row["x"]) if row["analysis"] != "emb" else round(float(row["x"]) / 5 - 0.1, 1)
-        key = row["analysis"], row["task"], row["method"], x
-        found[key] = float(row["mean"]), float(row["std"])
+    for file, key in (("results", "env task method phase"), ("analyses", "analysis task method x")):
+        for row in read(ROOT / f"results/published_{file}.csv"):
+            key_of_row = tuple(row[k] for k in key.split())
+            found[key_of_row] = float(row["mean"]), float(row["std"])
     return found
 
 
-def published(figure: str, place: Place, method: str, phase: str) -> tuple[float, float] | None:
-    """Published mean and standard deviation of one cell's phase, None where there are none."""
-    analysis = ANALYSES.get(figure, ("",))[0], place[1], method, tested(phase)
-    return all_published().get(analysis if figure in ANALYSES else (*place[:2], method, phase))
+def published(figure: str, place: Place, method: str, phase: str) -> tuple:
+    """Published mean and standard deviation of one cell's phase; (None, None) without them."""
+    key = *place[:2], method, phase
+    if figure in ANALYSES:
+        # Published distances are 0.5 .. 5 of another table: by rank, as our quantiles 0 .. 0.9 are.
+        by_rank = f"{5 * tested(phase) + 0.5:.1f}" if "embedding" in figure else None
+        key = ANALYSES[figure][0], place[1], method, by_rank or phase.split("=")[1]
+    return all_published().get(key, (None, None))
 
 
 def ceiling(place: Place) -> float | None:
@@ -176,7 +175,8 @@ def markdown(head: list[str], lines: list[list[str]]) -> str:
 
 def table(figure: str, cells: Cells) -> str:
     """One row per environment and method, one column per phase; published means in brackets."""
-    phases = [*dict.fromkeys(phase for cell in cells.values() for phase in cell)]
+    phases = dict.fromkeys(phase for cell in cells.values() for phase in cell)
+    phases = sorted(phases, key=lambda phase: [*HEADS, phase].index(phase))  # seen, unseen, others
     lines = []
     for (place, method), cell in cells.items():
         line = [title(place) * (len(places(cells)) > 1), METHODS[method][0], steps(place)]
@@ -185,10 +185,12 @@ def table(figure: str, cells: Cells) -> str:
             ours, theirs = cell.get(phase, []), published(figure, place, method, phase)
             line.append(f"{mean(ours):.3f}" if ours else "")
             line[-1] += f"±{pstdev(ours):.3f}" if len(ours) > 1 else ""
-            line[-1] += f" ({theirs[0]:.3f})" if ours and theirs else ""
-        lines.append([*line, "" if ceiling(place) is None else f"{ceiling(place):.3f}"])
-    heads = [HEADS.get(phase, phase.replace("=", " ")) for phase in phases]
-    return markdown([" ", "method", "steps", "seeds", *heads, "ceiling"], lines)
+            line[-1] += f" ({theirs[0]:.3f})" if ours and theirs[0] is not None else ""
+        known = "test" in cell and ceiling(place) is not None
+        lines.append([*line, f"{ceiling(place):.3f}" if known else ""])
+    heads = [HEADS.get(p, p.split("=")[-1] if figure in ANALYSES else p) for p in phases]
+    corner = ANALYSES.get(figure, (figure, " "))[1]
+    return markdown([corner, "method", "steps", "seeds", *heads, "ceiling"], lines)
 
 
 def adaptation_table(curves: Cells, zero: dict[Place, float]) -> str:
@@ -257,7 +259,7 @@ def draw_bars(path: Path, cells: Cells) -> None:
             if ours := cell.get(phase):
                 axis.barh(at, mean(ours), 0.36, color=METHODS[method][1], alpha=alpha)
                 axis.plot(ours, [at] * len(ours), ".", color="black", ms=3, zorder=3)
-                axis.barh(at, (published("", place, method, phase) or (0,))[0], 0.36, **outline)
+                axis.barh(at, published("", place, method, phase)[0] or 0, 0.36, **outline)
         if ceiling(place) is not None:
             key["ceiling, unseen"] = axis.axvline(ceiling(place), **line)
         axis.set(title=f"{title(place)}, {steps(place)} steps", xlabel=ENVIRONMENTS[place[0]][1])
@@ -266,54 +268,42 @@ def draw_bars(path: Path, cells: Cells) -> None:
     save(figure, path, key)
 
 
-def draw_lines(path: Path, figure: str, cells: Cells, zero: dict[Place, float]) -> None:
-    """Mean and standard deviation over phases, one panel per environment; published hollow."""
-    picture, axes = canvas(len(places(cells)), 3, 3.1, 2.4)
-    panels, key = dict(zip(places(cells), axes, strict=True)), {}
-    for (place, method), phases in cells.items():
-        (label, color), axis = METHODS[method], panels[place]
-        y, std = (np.array([f(numbers) for numbers in phases.values()]) for f in (mean, pstdev))
-        x = [tested(phase) / (1 if figure in ANALYSES else 1e6) for phase in phases]
-        style = dict(color=color, lw=1.4, ms=3.5, marker="o" if figure in ANALYSES else "")
-        (key[label],) = axis.plot(x, y, **style)
-        axis.fill_between(x, y - std, y + std, color=color, alpha=0.2, lw=0)
-        theirs = {tested(phase): published(figure, place, method, phase) for phase in phases}
-        if theirs := {x: pair for x, pair in theirs.items() if pair}:
-            look = dict(marker="s", mfc="white", lw=1, ls=":", alpha=0.6, capsize=2)
-            y, std = zip(*theirs.values(), strict=True)
-            key[f"{label}, published"] = axis.errorbar([*theirs], y, std, **style | look)
-        xlabel = ANALYSES.get(figure, ("", "million steps"))[1]
-        axis.set(title=title(place), xlabel=xlabel, ylabel=ENVIRONMENTS[place[0]][1])
-    for place, axis in panels.items():
-        if place in zero:
-            key["Ours, zero-shot"] = axis.axhline(zero[place], color="black", lw=1, ls="--")
+Line = tuple[str, dict[str, list[float]], dict]  # label, phase -> its seeds, Axes.plot's options
+
+
+def draw_lines(
+    path: Path, panels: dict[str, list[Line]], xlabel: str, columns=3, width=3.1
+) -> None:
+    """Mean and, as a band, standard deviation over the numbers in phases (or steps)."""
+    figure, axes = canvas(len(panels), columns, width, 0.3 + 0.7 * width)
+    key = {}
+    for axis, (name, some) in zip(axes, panels.items(), strict=True):
+        for label, phases, look in some:
+            x = [tested(phase) / (1e6 if xlabel == "million steps" else 1) for phase in phases]
+            y, std = (np.array([f(seeds) for seeds in phases.values()]) for f in (mean, pstdev))
+            (key[label],) = axis.plot(x, y, **dict(lw=1.3, ms=3.5) | look)
+            axis.fill_between(x, y - std, y + std, color=look["color"], alpha=0.12, lw=0)
+        axis.set_title(name, fontsize=8 if width > 2 else 7)
         axis.set_ylim(0, None)
-    save(picture, path, key, 3)
+    for axis in axes[-columns:]:
+        axis.set_xlabel(xlabel)
+    save(figure, path, key, 3)
 
 
-def draw_curves(path: Path, seen: Cells, valid: Cells) -> None:
-    """Figure 14: mean and standard deviation over seeds, raw; a row of panels per environment."""
-    lines = [[key for key in valid if key[0] == place] for place in places(valid)]
-    columns = max(map(len, lines))
-    keys = [line[i] if i < len(line) else None for line in lines for i in range(columns)]
-    figure, axes = canvas(len(keys), columns, 1.25, 1.2)
-    for axis, key in zip(axes, keys, strict=True):
-        if key is None:
-            axis.axis("off")
-            continue
-        place, (label, color) = key[0], METHODS[key[1]]
-        for points, look in ((seen[key], ("--", "0.45")), (valid[key], ("-", color))):
-            y, std = (np.array([f(p) for p in points.values()]) for f in (mean, pstdev))
-            x = [int(step) / 1e6 for step in points]
-            axis.plot(x, y, look[0], color=look[1], lw=1.2)
-            axis.fill_between(x, y - std, y + std, color=look[1], alpha=0.25, lw=0)
-        axis.set_ylim(0, 1 if place[0] in ("gridworld", "create") else None)
-        axis.tick_params(labelsize=6)
-        axis.set_title(label, fontsize=7)
-        if key[1] == "ours":
-            axis.set_ylabel(title(place).replace(" ", "\n"), fontsize=7)
-    figure.supxlabel("million steps; full: validation actions, dashed: training actions")
-    save(figure, path, {})
+def lines_of(figure: str, cells: Cells, zero: dict[Place, float]) -> dict[str, list[Line]]:
+    """A panel per environment for `draw_lines`: ours, published, the zero-shot score."""
+    panels = defaultdict(list)
+    for (place, method), phases in cells.items():
+        name, (label, color) = f"{title(place)}, {ENVIRONMENTS[place[0]][1]}", METHODS[method]
+        mark, hollow = "o" if figure in ANALYSES else "", dict(marker="s", mfc="white", alpha=0.5)
+        panels[name].append((label, phases, dict(color=color, marker=mark)))
+        theirs = {phase: published(figure, place, method, phase) for phase in phases}
+        if theirs := {p: [m - std, m + std] for p, (m, std) in theirs.items() if m is not None}:
+            panels[name].append((f"{label}, published", theirs, hollow | dict(color=color, ls=":")))
+        if place in zero:
+            level = {step: [zero[place]] for step in phases}
+            panels[name].append(("Ours, zero-shot", level, dict(color="black", ls="--")))
+    return panels
 
 
 def draw_embeddings(path: Path, figure: str) -> None:
@@ -324,7 +314,7 @@ def draw_embeddings(path: Path, figure: str) -> None:
     panels = {}  # label -> representations and labels of unseen actions
     for row in TABLE[figure]:
         job = paper.expand(figure, row, 0, paper.Args((figure,)))
-        module = importlib.import_module(ppo_actiongen.MODULES[job.args.env])
+        module = hvae.load_environment(job.args.env)
         split = module.split_actions(job.args.split, job.args.split_seed)
         unseen = np.setdiff1d([*split["valid"], *split["test"]], split["train"])
         if (ROOT / job.folder).exists():
@@ -352,42 +342,43 @@ def draw_embeddings(path: Path, figure: str) -> None:
 
 def section(name: str, draw: bool) -> str:
     """What stands between a name's markers, "" without results; with `draw`, the picture too."""
-    figure, path = name.removesuffix("-paper"), RESULTS / f"{name}.png"
+    figure, path, notes = name.removesuffix("-paper"), RESULTS / f"{name}.png", []
     files = {"main": MAIN, "fig14": [f"{f}_curves" for f in FIGURE_14]}.get(name, [name])
     rows = [row for file in files for row in read(RESULTS / f"{file}.csv")]
-    picture, notes = None, []
     if not rows:
         return ""
     if name == "fig14":
         seen, valid = (group(rows, "step", f"{phase}_score") for phase in ("train", "valid"))
-        text, picture = "", partial(draw_curves, path, seen, valid)
+        panels, grey = {}, dict(color="0.5", ls="--")
+        for (place, method), points in valid.items():
+            lines = [("training actions", seen[place, method], grey)]
+            lines.append(("validation actions", points, dict(color=METHODS[method][1])))
+            panels[f"{title(place)}\n{METHODS[method][0]}"] = lines
+        text, picture = "", partial(draw_lines, path, panels, "million steps", 9, 1.4)
     elif name == "fig9":
-        zero = group([row for row in rows if row["phase"] == "zero-shot"])
-        zero = {place[:2]: mean(phases["zero-shot"]) for (place, _), phases in zero.items()}
+        tests = group([row for row in rows if row["phase"] == "zero-shot"])
+        zero = {place: mean(cell["zero-shot"]) for (place, _), cell in tests.items()}
         curves = group(read(RESULTS / "fig9_curves.csv"), "step", "episode_score")
-        curves = {key: points for key, points in curves.items() if key[0][:2] in zero}
-        zero = {place: zero[place[:2]] for place in places(curves)}
-        text, picture = (
-            adaptation_table(curves, zero),
-            partial(draw_lines, path, name, curves, zero),
-        )
+        curves = {key: points for key, points in curves.items() if key[0] in zero}
+        text, lines = adaptation_table(curves, zero), lines_of(name, curves, zero)
+        picture = partial(draw_lines, path, lines, "million steps")
     elif name in ANALYSES:
-        cells = group(rows)
-        text, picture = table(name, cells), partial(draw_lines, path, name, cells, {})
+        text, lines = table(name, group(rows)), lines_of(name, group(rows), {})
+        picture = partial(draw_lines, path, lines, ANALYSES[name][1])
     elif figure in ("fig4", "fig5", "fig6"):
         text, picture = table(name, group(rows)), partial(draw_embeddings, path, figure)
     else:
         rows = [row for row in rows if row["phase"] != "valid"]
         cells = group(rows)
-        notes = drop_not_learned(cells, group(rows, column="stderr"))
-        chosen = SHOWN.get(name, METHODS)
-        text = table(name, {key: cell for key, cell in cells.items() if key[1] in chosen})
-        picture = (
-            partial(draw_bars, path, cells) if cells and name not in ("main", "quick") else None
+        notes, some = (
+            drop_not_learned(cells, group(rows, column="stderr")),
+            SHOWN.get(name, METHODS),
         )
-    if picture and draw:
+        text = table(name, {key: cell for key, cell in cells.items() if key[1] in some})
+        picture = partial(draw_bars, path, cells)
+    if draw and text + str(notes) and name not in ("main", "quick"):
         picture()
-    image = f"![{name}]({{folder}}{name}.png)" if picture and path.exists() else ""
+    image = f"![{name}]({{folder}}{name}.png)" if path.exists() else ""
     return "\n\n".join(filter(None, [text, *notes, image])) + "\n"
 
 
@@ -408,7 +399,7 @@ def main(check: bool = False) -> None:
             new = marks.sub(lambda m, content=content: m[1] + content + m[2], new)
         if check and new != text:
             raise SystemExit(
-                f"error: {page} disagrees with its CSV files: run benchmarks/report.py"
+                f"error: run benchmarks/report.py: {page} disagrees with the CSV files"
             )
         if new != text:
             page.write_text(new)

@@ -1,8 +1,8 @@
 """What each speed-up is worth: ratios, measured in one run of this script.
 
-    python benchmarks/throughput.py                        # all groups, about ten minutes
-    python benchmarks/throughput.py utility learner        # only these
-    python benchmarks/throughput.py random_play            # the score of a random policy, all tasks
+    python benchmarks/throughput.py                    # all groups
+    python benchmarks/throughput.py utility learner    # only these
+    python benchmarks/throughput.py random_play        # what a random policy scores, all tasks
 
 The two sides of a ratio take turns, so that whatever else the machine does slows both. The rates
 behind it are this machine's at this hour, and of no use elsewhere.
@@ -23,13 +23,8 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads that share a core wait for each other
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-
-ENVIRONMENTS = {
-    "gridworld": ("gridworld", "GridWorldEnv"),
-    "recsys": ("recsys", "RecSysEnv"),
-    "create": ("create_env", "CreateEnv"),
-    "stacking": ("stacking_env", "StackingEnv"),
-}
+CLASSES = {"gridworld": "GridWorldEnv", "recsys": "RecSysEnv", "create_env": "CreateEnv"}
+CLASSES |= {"stacking_env": "StackingEnv"}
 TASKS = "push navigate obstacle seesaw belt buckets cannon collide moving ladder basket funnel"
 
 
@@ -47,63 +42,68 @@ def compare(what: str, unit: str, works: dict[str, Callable[[], int]], seconds=6
     print(f"{what}: {a} : {b} = {fast / slow:.2f}   ({fast:,.0f} : {slow:,.0f} {unit})", flush=True)
 
 
-def make_env(name: str, actions: int = 1000, **options):
-    """An environment with the training actions, and an endless row of random actions for it."""
-    module, cls = ENVIRONMENTS[name]
-    module = importlib.import_module(module)
-    env = getattr(module, cls)(module.split_actions()["train"], **options)
+def make_env(name: str, **options):
+    """A module, one of its environments, and an endless row of random actions for that."""
+    module = importlib.import_module(name)
+    env = getattr(module, CLASSES[name])(module.split_actions()["train"], **options)
     env.action_space.seed(0)
     env.reset(seed=0)
-    return module, env, itertools.cycle([env.action_space.sample() for _ in range(actions)])
+    actions = [env.action_space.sample() for _ in range(5000)]
+    if name == "stacking_env":  # a random stop would come after two shapes
+        actions = [action | {"stop": 0} for action in actions]
+    return module, env, itertools.cycle(actions)
 
 
-def play(env, actions, steps: int) -> int:
-    """So many steps of one environment, restarts included."""
+def play(env, actions, steps: int, metric: str = "") -> list[float]:
+    """So many steps of one environment, restarts included; the metric of each episode."""
+    scores = []
     for action in itertools.islice(actions, steps):
-        _, _, terminated, truncated, _ = env.step(action)
+        _, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
+            scores.append(float(info.get(metric, 0)))
             env.reset()
-    return steps
+    return scores
 
 
 # ---- groups: one function each ----
 
 
 def environments() -> None:
-    """What gymnasium's vector environments cost or gain against one environment alone."""
-    for name in ENVIRONMENTS:
+    """32 environments in gymnasium's vector environment, against one alone."""
+    for name in CLASSES:
         module, env, actions = make_env(name)
         envs = module.make_vec(32, module.split_actions()["train"], seed=0)
-        envs.action_space.seed(0)
         envs.reset()
-        batches = itertools.cycle([envs.action_space.sample() for _ in range(100)])
+        batch = itertools.cycle([envs.action_space.sample() for _ in range(100)])
 
-        def together(envs=envs, batches=batches) -> int:
-            for batch in itertools.islice(batches, 10):
-                envs.step(batch)
-            return 320
+        def vector(envs=envs, batch=batch) -> int:
+            return len(envs.step(next(batch))[1])
 
-        alone = lambda env=env, actions=actions: play(env, actions, 320)  # noqa: E731
-        compare(name, "steps/s", {"32 together": together, "one alone": alone})
+        def alone(env=env, actions=actions) -> int:
+            play(env, actions, 32)
+            return 32
+
+        compare(name, "steps/s", {"vector": vector, "alone": alone})
         envs.close()
         env.close()
 
 
 def physics() -> None:
-    """Shape Stacking: stop when all shapes are at rest, against 300 steps after each action."""
-    module, ours, actions = make_env("stacking")
-    module.SOLVER_RESIDUAL = 1e-7  # Bullet's own
-    _, plain, same = make_env("stacking")
-    plain.early_stop = False
-    works = {"ours": lambda: play(ours, actions, 20), "plain": lambda: play(plain, same, 20)}
-    compare("stacking, physics and pictures", "steps/s", works, 20.0)
+    """Shape Stacking: until all shapes are at rest, against 300 exact steps after each action."""
+    module, env, actions = make_env("stacking_env")
+    ours = module.SOLVER_RESIDUAL
+
+    def run(early_stop: bool, residual: float) -> int:
+        env.early_stop, module.SOLVER_RESIDUAL = early_stop, residual
+        play(env, actions, 20)
+        return 20
+
+    works = {"ours": lambda: run(True, ours), "plain": lambda: run(False, 1e-7)}  # Bullet's own
+    compare("stacking", "steps/s", works, 20.0)
 
 
 def utility() -> None:
-    """The utility network on one minibatch, forward and backward: factorised, and D.3.2 as it reads.
-
-    Utility's own backward pass is compared with the same four lines left to autograd.
-    """
+    """Utility's own backward pass against autograd's, one minibatch forward and backward."""
     import torch
 
     from ppo_actiongen import Utility
@@ -114,81 +114,54 @@ def utility() -> None:
         ("Grid World, paper", 4096, 50, 1024),
         ("Recommender, paper", 2048, 500, 10_000),
     ):
-        H, D = 64, 16
-        u, w = torch.randn(B, H, requires_grad=True), torch.randn(H, requires_grad=True)
-        P, c = torch.randn(A, H, requires_grad=True), torch.randn(A, D)
+        u, P, w = (torch.randn(*shape, requires_grad=True) for shape in ((B, 64), (A, 64), (64,)))
         sets = torch.stack([torch.randperm(A)[:K] for _ in range(B)])  # (B, K)
-        project, hidden = torch.nn.Linear(D, H), torch.nn.Linear(2 * H, H)
 
         def kernel(u=u, P=P, w=w, sets=sets) -> int:
             Utility.apply(u, P, w, sets).square().mean().backward()
             return len(sets)
 
-        def four_lines(u=u, P=P, w=w, sets=sets) -> int:
-            (P[sets].add(u[:, None]).relu() @ w).square().mean().backward()
+        def plain(u=u, P=P, w=w, sets=sets) -> int:
+            ((P[sets] + u[:, None]).relu() @ w).square().mean().backward()  # (B, K)
             return len(sets)
 
-        def concatenated(u=u, w=w, sets=sets, c=c, project=project, hidden=hidden) -> int:
-            pairs = [u[:, None].expand(-1, sets.shape[1], -1), project(c[sets])]  # each (B, K, H)
-            (hidden(torch.cat(pairs, -1)).relu() @ w).square().mean().backward()
-            return len(sets)
-
-        compare(f"{name}, K={K}", "states/s", {"kernel": kernel, "four lines": four_lines})
-        compare(f"{name}, K={K}", "states/s", {"kernel": kernel, "concatenated": concatenated})
+        compare(f"{name}, K={K}", "states/s", {"kernel": kernel, "autograd": plain})
 
 
 def learner() -> None:
-    """Training end to end without evaluations, engineered actions: the recipes' rates."""
+    """Training end to end without evaluations, engineered actions: fast against paper's recipe."""
     for env, steps in (("gridworld", 200_000), ("recsys", 60_000), ("create", 25_000)):
-        rates = {}
-        for recipe in ("fast", "paper") * 2:
-            command = [sys.executable, str(ROOT / "ppo_actiongen.py"), env, "--recipe", recipe]
-            command += ["--representation", "engineered", "--total-timesteps", str(steps)]
-            command += ["--eval-every", str(10 * steps), "--valid-episodes", "2"]
+        rates: dict[str, list] = {"fast": [], "paper": []}
+        for recipe in [*rates] * 2:
             with tempfile.TemporaryDirectory() as folder:
-                command += ["--eval-episodes", "2", "--runs-dir", folder]
+                words = f"{env} --recipe {recipe} --representation engineered --eval-every 9999999"
+                words += f" --total-timesteps {steps} --valid-episodes 2 --eval-episodes 2"
+                command = [sys.executable, str(ROOT / "ppo_actiongen.py"), *words.split()]
+                command += ["--runs-dir", folder]
                 subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
                 (metrics,) = Path(folder).glob("*/metrics.csv")
-                rates.setdefault(recipe, [])
                 rates[recipe] += [float(row["sps"]) for row in csv.DictReader(metrics.open())]
-        fast, paper = (statistics.median(values) for values in rates.values())
+        fast, paper = map(statistics.median, rates.values())
         print(f"{env}: fast : paper = {fast / paper:.2f}   ({fast:,.0f} : {paper:,.0f} steps/s)")
 
 
 def random_play() -> None:
-    """What a random policy scores, the floor of every table (CHANCE in report.py)."""
-    rows = [("gridworld", {}, 400_000), ("recsys", {}, 100_000), ("stacking", {}, 1_000)]
-    rows += [("create", {"task": task}, 30_000) for task in TASKS.split()]
-    for name, options, steps in rows:
-        module, env, actions = make_env(name, steps, **options)
-        scores = []
-        for action in itertools.islice(actions, steps):
-            _, _, terminated, truncated, info = env.step(action)
-            if terminated or truncated:
-                scores.append(float(info[module.METRIC]))
-                env.reset()
-        env.close()
+    """What a random policy scores: CHANCE in report.py."""
+    rows = [("gridworld", {}, 400_000), ("recsys", {}, 100_000), ("stacking_env", {}, 1_000)]
+    for name, options, steps in rows + [("create_env", {"task": t}, 30_000) for t in TASKS.split()]:
+        module, env, actions = make_env(name, **options)
+        scores = play(env, actions, steps, module.METRIC)
         error = statistics.pstdev(scores) / len(scores) ** 0.5
-        what = " ".join([name, *options.values()])
-        print(f"{what}: {statistics.mean(scores):.4f} ± {error:.4f}, {len(scores)} episodes")
+        print(" ".join([name, *options.values()]), end=": ")
+        print(f"{statistics.mean(scores):.4f} ± {error:.4f}, {len(scores)} episodes", flush=True)
+        env.close()
 
 
 GROUPS = {f.__name__: f for f in (environments, physics, utility, learner, random_play)}
 
-
-def main(names: list[str]) -> None:
-    """Run the groups of these names (default: all)."""
-    if unknown := set(names) - set(GROUPS):
-        raise ValueError(f"group {min(unknown)!r} is not one of {', '.join(GROUPS)}")
-    for name in names or GROUPS:
-        print(f"\n{name}: {GROUPS[name].__doc__.splitlines()[0]}")
-        GROUPS[name]()
-
-
 if __name__ == "__main__":
-    if {"-h", "--help"} & set(sys.argv):
-        raise SystemExit(f"{__doc__}\ngroups: {', '.join(GROUPS)}")
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError) as e:
-        raise SystemExit(f"error: {e}") from None
+    for name in sys.argv[1:] or GROUPS:
+        if name not in GROUPS:
+            raise SystemExit(f"{__doc__}\nerror: {name!r} is not one of {', '.join(GROUPS)}")
+        print(f"\n{name}: {GROUPS[name].__doc__}")
+        GROUPS[name]()
