@@ -6,7 +6,7 @@ twelve tasks and 2,111 tools, and 6,248 more for the Full Split and the analyses
 
     python create_env.py --task push           # the best of 400 random episodes as a GIF, beside
                                                # it what the policy sees (--tries 1: a typical one)
-    python create_env.py --play --task push    # place the tools yourself: mouse, arrows, space
+    python create_env.py --play --task push    # place the tools yourself: mouse and space
     python create_env.py --all-tasks           # Figure 7: the 12 tasks on one sheet
     python create_env.py --show-tools          # four tools of each class
     python create_env.py --show-probe Cannon   # probe-ball trajectories over a tool (class or id)
@@ -33,8 +33,8 @@ A tool of your own is one line of KINDS. It gets the ids after all others and a 
 
     "Octagon": Kind("polygon", 159, ORANGE, 45, "octagon", "", POLYGONS, 8),
 
-What it does to a ball is a contact rule (`make_space`). Mind that pymunk prints an exception in a contact
-rule and swallows it: the run goes on as if the rule were not there. So watch stderr.
+What it does to a ball is a contact rule (`make_space`). Mind that pymunk prints an exception raised
+in a contact rule and swallows it: the run goes on without the rule. So watch stderr.
 """
 
 import colorsys
@@ -83,7 +83,6 @@ MIN_TOOL_GAP = 0.3  # published code, norm: tool centres this close "overlap"
 STILL_SPEED = 0.05  # published code, units/s: slower than this is "not moving"
 STILL_ACTIONS = 2  # published code: so many action ends without motion, in a row or not, are "over"
 HIT_DISTANCE = 0.03  # published code, share of the screen's diagonal: then the target counts as hit
-
 PICTURE_EVERY = 8  # ours, physics steps: 5 colour pictures per action
 
 BALL_RADIUS, BALL_MASS = 4.0, 10.0  # published code: target, marker, goal and probe ball
@@ -98,8 +97,7 @@ MODALITIES = ("xy", "state", "video")  # B: (x, y) of the ball is the default
 
 # ---- A.3 actions: the tools ----
 
-
-# Collision types: which pairs of shapes have a rule of their own (`make_space`). MOVING: balls, boxes.
+# Collision types: pairs of them have rules (`make_space`). MOVING: balls and loose boxes.
 NAMES = "PLAIN MOVING CANNON FAN BELT LADDER FUNNEL BUCKET PLANK GOAL"
 Contact = enum.IntEnum("Contact", NAMES, start=0)
 # Balls pass through these; only their rule acts.
@@ -201,11 +199,9 @@ KINDS: dict[str, Kind] = {
 # The order of the ids: learned tables and runs rely on it. A class of your own, not named here,
 # gets the ids after all others.
 ID_ORDER = (
-    # the Default Split
     *("Ramp", "Trampoline", "Triangle", "Bouncy Triangle", "Square", "Bouncy Square", "Pentagon"),
     *("Bouncy Pentagon", "Hexagon", "Bouncy Hexagon", "Hinged See-saw", "See-saw", "Cannon", "Fan"),
-    *("Funnel", "Bucket"),
-    # the Full Split alone
+    *("Funnel", "Bucket"),  # so far the Default Split; the others are in the Full Split alone
     *("Ball", "Bouncy Ball", "Lever", "Conveyor Belt"),
 )
 FIRST_LIMIT = 5  # published code, degrees: see-saw limits are 5, 20, 35, ...
@@ -243,8 +239,7 @@ DEGREES = np.array([t.max_angle - FIRST_LIMIT if t.max_angle else t.angle for t 
 
 def action_labels() -> np.ndarray:
     """Class of every tool, (NUM_ACTIONS,) of str: the names of Table 1, both see-saws as one."""
-    merged = {"Hinged See-saw": "See-saw"}
-    return np.array([merged.get(tool.kind, tool.kind) for tool in TOOLS])
+    return np.array([tool.kind.removeprefix("Hinged ") for tool in TOOLS])
 
 
 def engineered_representations() -> np.ndarray:
@@ -254,8 +249,8 @@ def engineered_representations() -> np.ndarray:
     largest angle (rad), weight, on_left, force, speed, standardised over the 2,326 tools that are
     15 degrees apart (over the 2,111 alone the speed would be constant).
     """
-    # published code: 23 classes (two box classes that no split uses) in an order that changes from
-    # run to run; we sort and leave the boxes out.
+    # published code: 23 classes (with two of boxes) in an order that changes from run to run; we
+    # sort and leave the boxes out, because no split uses them
     classes = sorted({tool.kind for tool in TOOLS})
     one_hot = np.array([[tool.kind == name for name in classes] for tool in TOOLS], np.float64)
     numbers = np.array([tool[1:] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
@@ -274,9 +269,8 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     | full     | 938   | 400   | 399   | by tool class, Table 1                                    |
     | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees, out of the pool at 3 degrees     |
 
-    The parts are disjoint. The no-op (id 0) is in none of them, because it is always on offer: the
-    paper's 2,111, 1,739 (where it counts twice) and 762 count it. Raises ValueError for an unknown
-    split.
+    The parts are disjoint. The no-op (id 0) is in none of them, because it is always on offer; the
+    paper's 2,111, 1,739 (twice) and 762 count it. Raises ValueError for an unknown split.
     """
     rng = np.random.default_rng(seed)
     group = np.array([KINDS[tool.kind].group for tool in TOOLS])
@@ -301,8 +295,8 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         raise ValueError(f"unknown split {split!r}; allowed: default, full, analysis")
     held_out = rng.permutation(np.flatnonzero(pool & ~train))
     half = math.ceil(len(held_out) / 2)
-    valid, test = np.sort(held_out[:half]), np.sort(held_out[half:])
-    return {"train": np.flatnonzero(train), "valid": valid, "test": test}
+    parts = np.flatnonzero(train), np.sort(held_out[:half]), np.sort(held_out[half:])
+    return dict(zip(("train", "valid", "test"), parts, strict=True))
 
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
@@ -323,8 +317,7 @@ def angle_gaps(action_ids: Sequence[int], train_ids: Sequence[int]) -> np.ndarra
     """Degrees to the nearest training tool of the same class, float64 (len(action_ids),).
 
     Angles wrap at the class's full turn (a ramp at 177 is 3 degrees from one at 0), see-saw limits
-    do not. A tool whose class has no training tool is infinitely far. Raises ValueError for ids
-    that do not exist.
+    do not. A tool whose class has no training tool is infinitely far. ValueError for bad ids.
     """
     # published code: compares with all classes at once, without wrapping (345 is 345 from 0)
     ids, train_ids = check_ids(action_ids), check_ids(train_ids)
@@ -362,9 +355,7 @@ class Task:
     marker: Item | None = None
     # half ranges (norm) of the uniform shifts of x and y, drawn once per name at every reset
     shifts: dict[str, tuple[float, float]] = field(default_factory=dict)
-    subgoals: tuple[
-        tuple[float, float], ...
-    ] = ()  # for the marker if there is one, else the target
+    subgoals: tuple = ()  # places (norm), for the marker if there is one, else the target
     boundary: str = ""  # of "R" right wall, "L" left wall, "C" ceiling; there is never a floor
     marker_must_hit: bool = False  # the target hit counts only after marker and target have touched
     target_hit_reward: float = LAMBDA_TARGET_HIT
@@ -373,7 +364,7 @@ class Task:
 
 
 def line(x, y, length, angle=0, shift="", kind="Thin line") -> Item:  # floor, ramp or wall
-    return Item(Tool(kind, 0.5, angle, length, 1.0), x, y, shift)
+    return Item(Tool(kind, 0.5, angle, length), x, y, shift)
 
 
 def ball(kind, x, y, shift="", size=BALL_RADIUS, mass=BALL_MASS, elasticity=1.0) -> Item:
@@ -403,14 +394,12 @@ TASKS: dict[str, Task] = {
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8, "marker"),
         target=ball("Target", 0.1, -0.47, "target"), goal=star(-0.9, -0.69),
-        items=(
-            line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
-            line(-0.8, -0.81, 16), line(0.12, -0.59, 16), line(-0.34, -0.70, 24.5, 22.5),
-            item("Box", -0.7, 0.3, **BOX), item("Box", -0.7, 0.2, **BOX),
-            line(-0.6, 0.18, 15, 90), line(-0.8, 0.18, 15, 90), line(0.35, 0.8, 15, 90),
-            item("Box", 0.25, 0.93, **BOX), item("Box", 0.25, 0.83, **BOX),
-            line(0.15, 0.8, 15, 90),
-        ),
+        items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
+               line(-0.8, -0.81, 16), line(0.12, -0.59, 16), line(-0.34, -0.70, 24.5, 22.5),
+               item("Box", -0.7, 0.3, **BOX), item("Box", -0.7, 0.2, **BOX),
+               line(-0.6, 0.18, 15, 90), line(-0.8, 0.18, 15, 90), line(0.35, 0.8, 15, 90),
+               item("Box", 0.25, 0.93, **BOX), item("Box", 0.25, 0.83, **BOX),
+               line(0.15, 0.8, 15, 90)),
         shifts={"marker": (0.02, 0.02), "target": (0.02, 0.0)},
         subgoals=((0.7, -0.1),), boundary="RLC", marker_must_hit=True,
         target_hit_reward=2.0,  # appendix: 1; published task file: 2; as published
@@ -418,11 +407,9 @@ TASKS: dict[str, Task] = {
     ),
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9, "target"), goal=star(-0.8, -0.8),
-        items=(
-            ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
-            item("See-saw", -0.3, -0.1, size=30, damping=1, max_angle=30, mass=1, on_left=True),
-            line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20),
-        ),
+        items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
+               item("See-saw", -0.3, -0.1, size=30, damping=1, max_angle=30, mass=1, on_left=True),
+               line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20)),
         shifts={"ball": (0.05, 0.05), "target": (0.1, 0.1)},
         subgoals=((-0.1, -0.45),), boundary="RLC",
     ),
@@ -430,40 +417,32 @@ TASKS: dict[str, Task] = {
     "navigate": Task(
         marker=ball("Marker", -0.6, 0.75),
         target=ball("Target", 0.1, -0.24, "target"), goal=star(-0.65, -0.59, "goal"),
-        items=(
-            line(0.1, -0.35, 16, 0, "target"), line(-0.65, -0.7, 16, 0, "goal"),
-            line(-0.5, 0.1, 40),
-        ),
+        items=(line(0.1, -0.35, 16, 0, "target"), line(-0.65, -0.7, 16, 0, "goal"),
+               line(-0.5, 0.1, 40)),
         shifts={"target": (0.1, 0.1), "goal": (0.2, 0.2)},
     ),
     "belt": Task(
         target=ball("Target", 0.75, 0.75, "target", size=3), goal=star(0.5, -0.7, "goal"),
-        items=(
-            item("Conveyor Belt", 0.55, 0.25, size=7, speed=-2.5),
-            item("Conveyor Belt", 0.05, 0.2, size=7, speed=-2.5),
-            item("Conveyor Belt", -0.3, -0.6, size=7, speed=5.0),
-            line(0.41, -0.30, 65, kind="Line"), line(-0.34, -0.17, 12.7, 90, kind="Line"),
-        ),
+        items=(item("Conveyor Belt", 0.55, 0.25, size=7, speed=-2.5),
+               item("Conveyor Belt", 0.05, 0.2, size=7, speed=-2.5),
+               item("Conveyor Belt", -0.3, -0.6, size=7, speed=5.0),
+               line(0.41, -0.30, 65, kind="Line"), line(-0.34, -0.17, 12.7, 90, kind="Line")),
         shifts={"target": (0.1, 0.1), "goal": (0.1, 0.1)},
         subgoals=((-0.6, -0.35), (-0.15, 0.28), (-0.1, -0.5)),
         max_actions=50,  # appendix: 30; published task file: 50; as published
     ),
     "buckets": Task(
         target=ball("Target", 0.75, 0.75, "target", size=3), goal=star(-0.85, -0.85),
-        items=(
-            line(-0.48, -0.99, 45), line(-0.75, -0.15, 25),
-            line(-0.99, -0.7, 45, 90), line(0.05, -0.7, 45, 90),
-            item("Bucket", 0.05, -0.10, size=4), item("Bucket", -0.45, -0.10, size=4),
-        ),
+        items=(line(-0.48, -0.99, 45), line(-0.75, -0.15, 25),
+               line(-0.99, -0.7, 45, 90), line(0.05, -0.7, 45, 90),
+               item("Bucket", 0.05, -0.10, size=4), item("Bucket", -0.45, -0.10, size=4)),
         shifts={"target": (0.1, 0.1)}, subgoals=((-0.20, -0.10),),
     ),
     "cannon": Task(
         marker=ball("Marker", 0.8, 0.75, "marker"),
         target=ball("Target", 0.4, 0.11, "target"), goal=star(-0.7, -0.1, "goal"),
-        items=(
-            line(-0.1, 0.35, 55, 90), item("Cannon", -0.1, -0.8, angle=110, force=140),
-            line(0.4, 0.0, 8, 0, "target"),
-        ),
+        items=(line(-0.1, 0.35, 55, 90), item("Cannon", -0.1, -0.8, angle=110, force=140),
+               line(0.4, 0.0, 8, 0, "target")),
         shifts={"marker": (0.1, 0.1), "target": (0.05, 0.05), "goal": (0.05, 0.05)},
         boundary="RC", marker_must_hit=True,
     ),
@@ -480,19 +459,15 @@ TASKS: dict[str, Task] = {
     "ladder": Task(
         marker=ball("Marker", 0.7, 0.75),
         target=ball("Target", 0.35, -0.09, "target"), goal=star(-0.75, -0.09, "goal"),
-        items=(
-            line(0.35, -0.2, 5, 0, "target"), line(-0.75, -0.2, 5, 0, "goal"),
-            item("Ladder", -0.1, -0.1, **STAIR | {"size": 20}),
-        ),
+        items=(line(0.35, -0.2, 5, 0, "target"), line(-0.75, -0.2, 5, 0, "goal"),
+               item("Ladder", -0.1, -0.1, **STAIR | {"size": 20})),
         shifts={"target": (0.1, 0.1), "goal": (0.2, 0.2)},
     ),
     "basket": Task(
         target=ball("Basketball", 0.75, 0.75, "target", size=3.5),
         goal=item("Basket", -0.75, 0.65, "goal", size=10),
-        items=(
-            item("Ladder", 0.5, -0.4, **STAIR), item("Ladder", -0.05, 0.0, **STAIR),
-            item("Ladder", -0.55, 0.35, **STAIR),
-        ),
+        items=(item("Ladder", 0.5, -0.4, **STAIR), item("Ladder", -0.05, 0.0, **STAIR),
+               item("Ladder", -0.55, 0.35, **STAIR)),
         shifts={"target": (0.1, 0.1), "goal": (0.1, 0.1)},
         subgoals=((0.35, -0.05), (-0.15, 0.35)),
         max_actions=40,  # appendix: 30; published task file: 40; as published
@@ -566,8 +541,7 @@ def outline(tool: Tool) -> list[tuple[float, float]]:
         return [(tool.size * math.cos(a), tool.size * math.sin(a)) for a in turns]
     if kind.family in ("box", "crate"):
         along, across = BOX_SIZE.get(tool.kind, (tool.size, tool.size))
-        signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-        return [at(i * along / 2, j * across / 2) for i, j in signs]
+        return [at(i * along / 2, j * across / 2) for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
     return []
 
 
@@ -579,10 +553,10 @@ class Thing:
     kind: Kind
     x: float
     y: float
+    corners: list  # of `outline`, units; what moves does not keep them
     shape: pymunk.Shape = None
     body: pymunk.Body = None  # only if it can move
     parts: tuple = ()  # everything to add to the space, bodies first
-    corners: list = field(default_factory=list)  # units, of what stands still
     wants: "Thing" = None  # the ball whose touch this goal, subgoal or marker waits for ...
     touched: bool = False  # ... and whether it came
     holder: "Thing" = None  # the bucket that holds this ball
@@ -596,49 +570,43 @@ class Thing:
 
 def build(tool: Tool, x: float, y: float, static_body: pymunk.Body) -> Thing:
     """Make an object at (x, y) units, not yet added to a space. `static_body`: that space's."""
-    kind, corners = KINDS[tool.kind], outline(tool)
-    thing, mass, size = Thing(tool, kind, float(x), float(y)), tool.mass, tool.size
-    place, more = (thing.x, thing.y), []
-    thing.corners = [(x + u, y + v) for u, v in corners]
-    if kind.family == "ball":
-        thing.body = pymunk.Body(mass, mass * size**2 / 2)
-        thing.shape = pymunk.Circle(thing.body, size)
-    elif kind.family == "crate":
-        thing.body = pymunk.Body(mass, mass * 2 * size**2 / 12)
-        thing.shape = pymunk.Poly.create_box(thing.body, (size, size))
-    elif kind.family == "plank":
+    kind, corners, mass, size = KINDS[tool.kind], outline(tool), tool.mass, tool.size
+    thing = Thing(tool, kind, float(x), float(y), [(x + u, y + v) for u, v in corners])
+    family, place, body, joints = kind.family, (thing.x, thing.y), static_body, []
+    moments = {"ball": mass * size**2 / 2, "crate": mass * size**2 / 6, "plank": PLANK_MOMENT}
+    if family in moments:
+        body = pymunk.Body(PLANK_MASS if family == "plank" else mass, moments[family])
+        body.position, thing.body = place, body
+    if family in ("ball", "disc"):
+        at = (0.0, 0.0) if thing.body else place
+        shape = pymunk.Circle(body, size or NO_OP_RADIUS, at)
+    elif family == "crate":
+        shape = pymunk.Poly.create_box(body, (size, size))
+    elif family == "segment":
+        shape = pymunk.Segment(body, *thing.corners, kind.radius)
+    elif family == "plank":
         # published code: a pin joint of length zero and a slide joint; we use the joints made for
         # the purpose, because with them the centre stays put (same motion on average)
-        thing.body = body = pymunk.Body(PLANK_MASS, PLANK_MOMENT)
-        thing.shape = pymunk.Segment(body, *corners[:2], 0.0)
-        body.position = place
-        more.append(pymunk.PivotJoint(body, static_body, place))
+        shape = pymunk.Segment(body, *corners[:2], 0.0)
+        joints.append(pymunk.PivotJoint(body, static_body, place))
         if tool.max_angle:  # the tilt at the start is part of the segment, the body starts at 0
             limit = math.radians(tool.max_angle)
             tilt = (-limit if tool.on_left else limit) if mass else 0.0
-            more.append(pymunk.RotaryLimitJoint(static_body, body, -limit - tilt, limit - tilt))
+            joints.append(pymunk.RotaryLimitJoint(static_body, body, -limit - tilt, limit - tilt))
         for at in thing.corners[2:]:
             weight = pymunk.Body(mass, mass)  # published code: mass = moment, no shape
             weight.position = at
-            joints = pymunk.PivotJoint(body, weight, at), pymunk.GearJoint(body, weight, 0.0, 1.0)
-            more += [weight, *joints]
-    elif kind.family == "segment":
-        thing.shape = pymunk.Segment(static_body, *thing.corners, kind.radius)
-    elif kind.family == "disc":
-        thing.shape = pymunk.Circle(static_body, size or NO_OP_RADIUS, place)
+            joints += [weight, pymunk.PivotJoint(body, weight, at)]
+            joints.append(pymunk.GearJoint(body, weight, 0.0, 1.0))
     else:
-        thing.shape = pymunk.Poly(static_body, thing.corners)
-    if thing.body:
-        thing.body.position = place
-        more.insert(0, thing.body)
-    thing.parts = (*more, thing.shape)
-    shape, vessel = thing.shape, kind.family == "vessel"
+        shape = pymunk.Poly(body, thing.corners)
     shape.collision_type, shape.sensor = int(kind.contact), kind.contact in SENSORS
     # The contact law multiplies both numbers of the two shapes; a ball's are 1.
-    shape.elasticity = VESSEL_ELASTICITY if vessel else float(tool.elasticity)
+    shape.elasticity = VESSEL_ELASTICITY if family == "vessel" else float(tool.elasticity)
     # published code: never sets the friction of ball tools and planks, which leaves it at 0
-    shape.friction = 0.0 if kind.family in ("disc", "plank") else 1.0
+    shape.friction = 0.0 if family in ("disc", "plank") else 1.0
     shape.thing = thing  # so that a contact rule knows what it has before it
+    thing.shape, thing.parts = shape, (*([body] if thing.body else []), *joints, shape)
     return thing
 
 
@@ -649,29 +617,25 @@ def build(tool: Tool, x: float, y: float, static_body: pymunk.Body) -> Thing:
 # step must write True as well as False.
 
 
-def _stop(body: pymunk.Body, position: tuple[float, float]) -> None:
-    """Put a body somewhere, at rest."""
+def _stop(body: pymunk.Body, position: tuple[float, float]) -> None:  # there, at rest
     body.position, body.velocity, body.force = position, (0.0, 0.0), (0.0, 0.0)
     body.angle = body.angular_velocity = body.torque = 0.0
 
 
-def _on_goal(arbiter, space, data) -> None:
-    """Goals and subgoals remember the touch of the ball they wait for."""
+def _on_goal(arbiter, space, data) -> None:  # goals and subgoals remember the touch they wait for
     a, b = (shape.thing for shape in arbiter.shapes)
     a.touched |= a.wants is b
     b.touched |= b.wants is a
 
 
-def _on_carrier(arbiter, space, data) -> None:
-    """Belts and ladders: the ball moves as they do."""
+def _on_carrier(arbiter, space, data) -> None:  # on belts and ladders a ball moves as they do
     ball, carrier = arbiter.shapes
     speed, aim = carrier.thing.tool.speed, math.radians(carrier.thing.tool.angle)
     lean = LADDER_LEAN if carrier.thing.kind.contact == Contact.LADDER else 1.0
     ball.body.velocity = lean * speed * math.cos(aim), speed * math.sin(aim)
 
 
-def _on_cannon(arbiter, space, data) -> None:
-    """Catch the ball and shoot it; only when contact begins, so the shot is not caught again."""
+def _on_cannon(arbiter, space, data) -> None:  # when contact begins, lest it catch its own shot
     ball, cannon = (shape.thing for shape in arbiter.shapes)
     if ball.holder is not None:  # by a bucket, for good
         return
@@ -681,8 +645,7 @@ def _on_cannon(arbiter, space, data) -> None:
     ball.body.velocity = speed * direction[0], speed * direction[1]
 
 
-def _on_fan(arbiter, space, data) -> None:
-    """Blow with the same force anywhere in the box."""
+def _on_fan(arbiter, space, data) -> None:  # the same force anywhere in the box
     ball, fan = arbiter.shapes
     aim, force = math.radians(fan.thing.tool.angle), fan.thing.tool.force
     push = force * math.cos(aim), force * math.sin(aim)
@@ -691,8 +654,7 @@ def _on_fan(arbiter, space, data) -> None:
     ball.body.apply_force_at_world_point(push, ball.body.position)
 
 
-def _on_funnel(arbiter, space, data) -> None:
-    """A ball on the side of the mouth leaves by the nozzle; from outside a funnel is solid."""
+def _on_funnel(arbiter, space, data) -> None:  # in by the mouth, out by the nozzle, else solid
     ball, funnel = (shape.thing for shape in arbiter.shapes)
     left, nozzle, right = (math.dist(ball.body.position, corner) for corner in funnel.corners)
     caught = ball.holder is None and nozzle > left and nozzle > right
@@ -701,8 +663,7 @@ def _on_funnel(arbiter, space, data) -> None:
     arbiter.process_collision = not caught
 
 
-def _on_bucket(arbiter, space, data) -> None:
-    """A ball that comes in by the opening is held in the middle for good."""
+def _on_bucket(arbiter, space, data) -> None:  # holds what comes in by the opening for good
     ball, bucket = (shape.thing for shape in arbiter.shapes)
     if ball.holder is None:
         d1, d2, d3, d4 = (math.dist(ball.body.position, corner) for corner in bucket.corners)
@@ -715,8 +676,7 @@ def _on_bucket(arbiter, space, data) -> None:
     arbiter.process_collision = ball.holder is None
 
 
-def _on_plank(arbiter, space, data) -> None:
-    """Planks with a damping above 1 slow a ball at every step of contact."""
+def _on_plank(arbiter, space, data) -> None:  # a damping above 1 slows a ball at every step
     ball, plank = (shape.thing for shape in arbiter.shapes)
     keep = 2.0 - plank.tool.damping
     if ball.kind.family == "ball" and keep < 1.0:  # writing a speed wakes a sleeping ball
@@ -821,8 +781,9 @@ def _look_bar(tool, kind, colour, corners, at):  # ramps, walls; trampolines; be
         below = -1 if math.cos(math.radians(tool.angle)) > -1e-9 else 1  # the side of the ground
         for u in (-0.75 * half, 0.75 * half):
             yield [at(u), at(1.1 * u, 2.6 * below)], 0.6, None, "#9aa0ac"
-    yield corners, width, kind.grey, shade(colour, 0.72)
-    yield corners, 0.62 * width, None, "#8fb8ff" if tool.kind == "Trampoline" else colour
+        colour = "#8fb8ff"
+    yield corners, width, kind.grey, shade(kind.colour, 0.72)
+    yield corners, (0.4 if tool.kind == "Trampoline" else 0.62) * width, None, colour
     if tool.kind == "Conveyor Belt":
         way, rollers = math.copysign(1, tool.speed), max(2, int(half // 1.2))
         yield [corners[tool.speed > 0]], 3.6, kind.grey, None
@@ -952,16 +913,6 @@ class Canvas:
                 pen.ellipse((left, top, left + wide - 1, top + wide - 1), fill=ink)
         return self
 
-    def write(self, left: str, right: str, colour: str) -> None:
-        """The caption: words at its left and right end."""
-        corners = [(0, 0), (WORLD, 0), (WORLD, -CAPTION), (0, -CAPTION)]
-        edge = ([(0, -0.1), (WORLD, -0.1)], 0.25, None, "#cfcdd6")
-        self.draw([(corners, 0, None, PAPER), edge])
-        font, pen = ImageFont.load_default(3.1 * self.scale), ImageDraw.Draw(self.image)
-        y = (WORLD + CAPTION / 2) * self.scale
-        pen.text((1.5 * self.scale, y), left, INK, font, "lm")
-        pen.text(((WORLD - 1.5) * self.scale, y), right, colour, font, "rm")
-
     def picture(self) -> np.ndarray:
         """uint8 (size, size) grey, or (height, size, 3) in colour."""
         return np.array(self.image.reduce(self.fine))
@@ -969,15 +920,11 @@ class Canvas:
 
 # ---- A.3 the environment ----
 
-
-class Placement(enum.Enum):
-    """What came of the last action (`CreateEnv.placement`): words and colour for the caption."""
-
-    PLACED = ("placed", "#2a7f3f")
-    NO_OP = ("waits", "#6a6772")
-    NEAR_TOOL = ("too close to a tool", "#c1121f")
-    ON_SHAPE = ("blocked by a shape", "#c1121f")  # goals and subgoals included
-    OUTSIDE = ("outside the screen", "#c1121f")
+# What came of the last action (`CreateEnv.placement`). TOO_CLOSE: to a tool placed before. BLOCKED:
+# by a shape, goals and subgoals included. OUTSIDE: of the screen.
+Placement = enum.Enum("Placement", "PLACED WAITED TOO_CLOSE BLOCKED OUTSIDE")
+PENALTY = {Placement.TOO_CLOSE: LAMBDA_OVERLAP, Placement.BLOCKED: LAMBDA_OVERLAP}
+PENALTY |= {Placement.OUTSIDE: LAMBDA_INVALID}
 
 
 class CreateEnv(gym.Env):
@@ -994,13 +941,12 @@ class CreateEnv(gym.Env):
     ## Observation Space
     | key       | space                              | meaning                                    |
     |-----------|------------------------------------|--------------------------------------------|
-    | state     | Box(0, 255, (3, 84, 84), uint8)    | last 3 grey pictures, newest last; black   |
-    |           |                                    | before the episode began                   |
+    | state     | Box(0, 255, (3, 84, 84), uint8)    | last 3 grey pictures, newest last          |
     | available | Box(0, NUM_ACTIONS-1, (K,), int64) | the tools on offer in this episode         |
 
-    `available` is the no-op and K - 1 tools, drawn without replacement from the pool at every
-    reset. So it is for every pool: N tools allow K up to N + 1. With K = N + 1 there is nothing to
-    draw: the no-op, then the pool in sorted order, so that positions keep their meaning.
+    Before the first picture `state` is black. `available` is the no-op and K - 1 tools, drawn
+    without replacement from the pool at every reset. So it is for every pool: N tools allow K up to
+    N + 1, and then there is nothing to draw: the no-op, then the pool in sorted order.
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a blocked placement or
@@ -1036,11 +982,8 @@ class CreateEnv(gym.Env):
         ids = check_ids(split_actions()["train"] if action_pool is None else action_pool)
         self.action_pool = np.sort(ids[ids != NO_OP])
         check_ids([NO_OP, *self.action_pool], num_available)
-        self.num_available, self.task, self.subgoal_reward = (
-            num_available,
-            TASKS[task],
-            subgoal_reward,
-        )
+        self.num_available, self.task = num_available, TASKS[task]
+        self.subgoal_reward = subgoal_reward
         self.render_mode, self.render_size = render_mode, render_size
         self.observation_space = spaces.Dict(
             state=spaces.Box(0, 255, (NUM_FRAMES, 84, 84), np.uint8),
@@ -1064,11 +1007,12 @@ class CreateEnv(gym.Env):
         self._centres: list[list[float]] = []  # norm, of the tools placed so far
         self._goal_hit, self._target_hit = False, self._marker is None
         self._still, self._actions, self._over = 0, 0, False
-        self._tool, self._position, self.placement = TOOLS[NO_OP], [0.0, 0.0], Placement.NO_OP
+        self._tool, self._position, self.placement = TOOLS[NO_OP], [0.0, 0.0], Placement.WAITED
         self._frames = np.zeros((NUM_FRAMES, 84, 84), np.uint8)
         self._trails = [(ball, []) for ball in (self._target, self._marker) if ball]
+        observation = self._observe()
         self._pictures = [self._draw()] if self.render_mode else []
-        return self._observe(), {}
+        return observation, {}
 
     def _build_level(self) -> None:
         """A fresh space with the task's objects."""
@@ -1079,7 +1023,9 @@ class CreateEnv(gym.Env):
         def add(item: Item, side: int = 1) -> Thing:
             dx, dy = shift.get(item.shift, (0.0, 0.0))
             x, y = to_units(side * item.x + dx), to_units(item.y + dy)
-            return self._add(build(item.tool, x, y, self._space.static_body))
+            self._things.append(build(item.tool, x, y, self._space.static_body))
+            self._space.add(*self._things[-1].parts)
+            return self._things[-1]
 
         self._marker = add(task.marker) if task.marker else None
         for one in task.items:
@@ -1096,17 +1042,8 @@ class CreateEnv(gym.Env):
             subgoal.wants = self._marker or self._target
         self._repaint()
 
-    def _add(self, thing: Thing) -> Thing:
-        self._space.add(*thing.parts)
-        self._things.append(thing)
-        return thing
-
     def step(self, action: dict):
-        """Place a tool, run 40 physics steps, settle accounts.
-
-        Raises ValueError for an action that is not a choice in 0..K-1 and two finite numbers, and
-        gymnasium's ResetNeeded after the end of an episode.
-        """
+        """Place a tool, run 40 physics steps, settle accounts. After the end: ResetNeeded."""
         choice, position = action["choice"], np.asarray(action["position"], np.float64)
         if not self.action_space["choice"].contains(choice):
             raise ValueError(f"choice must be 0..{self.num_available - 1}, got {choice!r}")
@@ -1123,16 +1060,16 @@ class CreateEnv(gym.Env):
         self._actions += 1
         reward = self._reward(*self._settle())
         terminated, truncated = self._ended()
-        self._over = terminated or truncated
+        self._over, observation = terminated or truncated, self._observe()
         if self.render_mode:
             self._pictures.append(self._draw())
         info = {METRIC: float(self._goal_hit)} if self._over else {}
-        return self._observe(), reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
     def _place(self) -> Placement:
         """Put the chosen tool at its position if it may stand there."""
         if self._tool.kind == "No-op":
-            return Placement.NO_OP
+            return Placement.WAITED
         # appendix: a penalty "for placing outside the scene"; published code: clips the position
         # first, so its penalty never fires; we do not clip, because the appendix has it
         if max(map(abs, self._position)) > 1.0:
@@ -1140,12 +1077,14 @@ class CreateEnv(gym.Env):
         # appendix: "overlap over existing objects"; published code: this distance to earlier tools,
         # or contact of the exact shapes with anything in the scene. As published.
         if any(math.dist(self._position, centre) <= MIN_TOOL_GAP for centre in self._centres):
-            return Placement.NEAR_TOOL
+            return Placement.TOO_CLOSE
         thing = build(self._tool, *map(to_units, self._position), self._space.static_body)
         if self._space.shape_query(thing.shape):  # sensors count
-            return Placement.ON_SHAPE
+            return Placement.BLOCKED
+        self._space.add(*thing.parts)
+        self._things.append(thing)
         self._centres.append(self._position)
-        self._paint([self._add(thing)])
+        self._paint([thing])
         return Placement.PLACED
 
     def _settle(self) -> tuple[bool, int, bool]:
@@ -1159,8 +1098,7 @@ class CreateEnv(gym.Env):
             self._target_hit = moved
         # published code: tests the goal before the target hit and never forgets a touch, so a goal
         # touched too soon counts at the hit, wherever the target is by then. We: a touch in the
-        # action of the hit counts, an earlier one does not, because the target has to come to rest
-        # with the goal, not to have passed it.
+        # action of the hit counts, an earlier one does not, because the hit is the way to the goal.
         self._goal.touched = self._goal_hit = self._target_hit and self._goal.touched
         # published code: a subgoal counts if touched at the end of an action; we: at any time in
         # it, because that is the rule of the goal
@@ -1176,11 +1114,7 @@ class CreateEnv(gym.Env):
     def _reward(self, goal: bool, subgoals: int, target_moved: bool) -> float:
         """Equation 3. Appendix: products of the bonus terms; published code: sums, as here."""
         # published code: the goal and each subgoal pay 0.1 less per placed tool; we: as Eq. 3
-        reward = LAMBDA_ALIVE + goal * LAMBDA_GOAL
-        if self.placement in (Placement.NEAR_TOOL, Placement.ON_SHAPE):
-            reward += LAMBDA_OVERLAP
-        if self.placement == Placement.OUTSIDE:
-            reward += LAMBDA_INVALID
+        reward = LAMBDA_ALIVE + goal * LAMBDA_GOAL + PENALTY.get(self.placement, 0.0)
         # C.3 names subgoals; push has none and was run without them all the same, so the reward for
         # the target hit must have been meant too.
         if self.subgoal_reward:
@@ -1226,7 +1160,7 @@ class CreateEnv(gym.Env):
         return {"state": self._frames.copy(), "available": self.available.copy()}
 
     def _draw(self) -> np.ndarray:
-        """The colour picture of this moment, with trails, the last tool's fate and a caption."""
+        """This moment in colour, with trails and a caption; beside it the policy's last state."""
         canvas = self._canvases[1].copy()
         for ball, trail in self._trails:  # dots that fade with age
             trail.append(ball.pose()[:2])
@@ -1234,29 +1168,35 @@ class CreateEnv(gym.Env):
                 alpha = 40 + 150 * k // min(len(trail), 90)
                 canvas.draw([([point], 1.1, None, shade(ball.kind.colour, 1.1, alpha))])
         canvas.draw(self._moving())
-        words, colour = self.placement.value if self._actions else ("", INK)
-        if self.placement not in (Placement.PLACED, Placement.NO_OP):  # a cross where it may not be
-            x, y = np.clip([to_units(value) for value in self._position], 2, WORLD - 2)
+        words, colour = self.placement.name.lower().replace("_", " "), "#2a7f3f"
+        if self.placement in PENALTY:  # a red cross where it may not stand
+            (x, y), colour = np.clip(np.add(self._position, 1) * 42, 2, WORLD - 2), "#c1121f"
             for v in (-1.6, 1.6):
                 canvas.draw([([(x - 1.6, y - v), (x + 1.6, y + v)], 0.8, None, colour)])
         if self._goal_hit:
-            words, colour, at = "goal!", "#2a7f3f", frame(*self._goal.pose())
+            words, (x, y) = "goal!", self._goal.pose()[:2]
             turns = [k / 18 * math.pi for k in range(37)]
-            ring = [at(7.1 * math.cos(turn), 7.1 * math.sin(turn)) for turn in turns]
+            ring = [(x + 7.1 * math.cos(turn), y + 7.1 * math.sin(turn)) for turn in turns]
             canvas.draw([(ring, 0.8, None, GREEN)])
-        name = self._tool.kind if self._actions else ""
-        canvas.write(f"{self._actions}/{self.task.max_actions}  {name}", words, colour)
-        return canvas.picture()
+        paper = [(0, 0), (WORLD, 0), (WORLD, -CAPTION), (0, -CAPTION)]
+        canvas.draw([(paper, 0, None, PAPER), (paper[:2], 0.25, None, "#cfcdd6")])
+        pen, scale = ImageDraw.Draw(canvas.image), canvas.scale
+        font, y = ImageFont.load_default(3.1 * scale), (WORLD + CAPTION / 2) * scale
+        name = f"{self._actions}/{self.task.max_actions}  {self._tool.kind}"
+        pen.text((1.5 * scale, y), name, INK, font, "lm")
+        pen.text(((WORLD - 1.5) * scale, y), words * (self._actions > 0), colour, font, "rm")
+        picture, size, eye = canvas.picture(), self.render_size, np.vstack(self._frames)
+        page = Image.new("RGB", (size + 6 + size // 3, len(picture)), PAPER)
+        page.paste(Image.fromarray(picture))
+        page.paste(Image.fromarray(eye).resize((size // 3, size)), (size + 6, 0))
+        return np.array(page)
 
     def render(self) -> np.ndarray | None:
-        """The scene now, in colour, uint8 (height, render_size, 3); None without render_mode."""
+        """The scene now and what the policy sees, uint8 (height, width, 3), or None."""
         return self.render_frames()[-1] if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step: 5, or 1 right after a reset, or none without render_mode.
-
-        Raises gymnasium's ResetNeeded before the first reset.
-        """
+        """Pictures of the last step: 5, or 1 right after a reset, or none without render_mode."""
         if self.render_mode and not self._pictures:
             raise gym.error.ResetNeeded("call reset() before the first picture")
         return self._pictures
@@ -1305,10 +1245,7 @@ def action_observations(action_ids, num_observations, modality="xy", seed=0, wor
     """
     ids, shapes = check_ids(action_ids), {"xy": (2,), "state": (6,), "video": (PROBE_VIDEO,) * 2}
     if modality not in shapes or num_observations < 1:
-        raise ValueError(
-            f"need a modality of {', '.join(MODALITIES)} and 1 or more observations, "
-            f"got {modality!r} and {num_observations}"
-        )
+        raise ValueError(f"{modality!r} is not one of {MODALITIES}, or n is below 1")
     shape = (len(ids), num_observations, PROBE_LENGTH, *shapes[modality])
     result = np.empty(shape, np.uint8 if modality == "video" else np.float32)
     job = functools.partial(_record, num_observations, modality, seed)
@@ -1352,13 +1289,11 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
 def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray]:
     """Launch m balls at m copies of a tool, each pair in its own cell of one big space.
 
-    places, start (m, 2) norm; velocity (m, 2) units/s. Returns states (m, 9, 7) float32, six
-    numbers and a plank's angle (rad), and the step of the first contact (m,): 0 overlap at launch,
-    91 never.
+    places, start (m, 2) norm; velocity (m, 2) units/s. Returns states (m, 9, 7) float32, the last
+    number a plank's angle, and the step of the first contact (m,): 0 overlap at launch, 91 never.
     """
     m, space, met = len(places), make_space(), []
-    note = lambda arbiter, *_: met.append(arbiter.shapes[0].thing)
-    space.on_collision(Contact.MOVING, None, begin=note)
+    space.on_collision(Contact.MOVING, begin=lambda a, *_: met.append(a.shapes[0].thing))
     offsets = CELL * np.stack(np.divmod(np.arange(m), math.ceil(math.sqrt(m))), axis=1)  # (m, 2)
     tools = [build(tool, *at, space.static_body) for at in (to_units(places) + offsets).tolist()]
     balls = [build(PROBE_BALL, *at, None) for at in (to_units(start) + offsets).tolist()]
@@ -1387,8 +1322,8 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
 def _film(tool: Tool, states: np.ndarray) -> np.ndarray:
     """One tool's trajectories (n, 7, 7) as pictures, uint8 (n, 7, 48, 48).
 
-    "Collected identically as the state case, only the modality changes" (B): the whole scene, with
-    the tool where it stands.
+    B: "collected identically as the state case, only the modality changes". So the camera sees the
+    whole scene, with the tool where it stands.
     """
     blank, video = Canvas(PROBE_VIDEO), np.empty((*states.shape[:2], 48, 48), np.uint8)
     for frame_at in np.ndindex(states.shape[:2]):
@@ -1415,41 +1350,30 @@ def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None
     temporary.replace(path)
 
 
-def beside(picture: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """A colour picture, and beside it the grey ones the policy sees, the newest at the bottom."""
-    height, width, _ = picture.shape
-    page = Image.new("RGB", (width + 6 + width // 3, height), PAPER)
-    page.paste(Image.fromarray(picture), (0, 0))
-    page.paste(Image.fromarray(state.reshape(-1, 84)).resize((width // 3, width)), (width + 6, 0))
-    return np.array(page)
-
-
 def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, int]:
     """A random episode: (frames, return, length). A tool is tried on half the steps."""
     rng, total, length, over = np.random.default_rng(seed), 0.0, 0, False
-    state = env.reset(seed=seed)[0]["state"]
-    frames = [beside(picture, state) for picture in env.render_frames()]
+    env.reset(seed=seed)
+    frames = env.render_frames()
     while not over:
         choice = int(rng.integers(env.num_available)) if rng.random() < 0.5 else NO_OP
         action = {"choice": choice, "position": rng.uniform(-0.9, 0.9, 2)}
-        observation, reward, terminated, truncated, _ = env.step(action)
-        # beside what happens stands what was seen when the tool was chosen
-        frames += [beside(picture, state) for picture in env.render_frames()]
-        state, total, length = observation["state"], total + reward, length + 1
-        over = terminated or truncated
+        _, reward, terminated, truncated, _ = env.step(action)
+        total, length, over = total + reward, length + 1, terminated or truncated
+        frames = frames + env.render_frames()
     return frames, total, length
 
 
-def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> Image.Image:
-    """Square pictures of one size on a sheet, a title under each."""
-    size, bar, gap = tiles[0].shape[1], 26, 10
+def sheet(tiles: dict[str, np.ndarray], columns: int) -> Image.Image:
+    """Square pictures of one size on a sheet, their titles under them."""
+    size, bar, gap = next(iter(tiles.values())).shape[1], 26, 10
     rows = math.ceil(len(tiles) / columns)
     shape = (columns * (size + gap) + gap, rows * (size + bar + gap) + gap)
     page, font = Image.new("RGB", shape, "white"), ImageFont.load_default(size=17)
     pen = ImageDraw.Draw(page)
-    for k, (tile, title) in enumerate(zip(tiles, titles, strict=True)):
+    for k, (title, tile) in enumerate(tiles.items()):
         x, y = gap + k % columns * (size + gap), gap + k // columns * (size + bar + gap)
-        page.paste(Image.fromarray(tile[:size]), (x, y))  # without its caption
+        page.paste(Image.fromarray(tile), (x, y))
         pen.rectangle((x, y, x + size - 1, y + size - 1), outline="#b8b6c0")
         pen.text((x + size / 2, y + size + bar / 2 + 1), title, INK, font, "mm")
     return page
@@ -1457,43 +1381,43 @@ def sheet(tiles: Sequence[np.ndarray], titles: Sequence[str], columns: int) -> I
 
 def tasks_sheet() -> Image.Image:
     """Figure 7: the 12 tasks as they start."""
-    envs = [CreateEnv(task=task, render_mode="rgb_array", render_size=300) for task in TASKS]
-    for env in envs:
+    tiles = {}
+    for letter, task in zip("abcdefghijkl", TASKS, strict=False):
+        env = CreateEnv(task=task, render_mode="rgb_array", render_size=300)
         env.reset(seed=0)
-    titles = [f"({chr(97 + k)}) {task}" for k, task in enumerate(TASKS)]
-    return sheet([env.render() for env in envs], titles, 4)
+        tiles[f"({letter}) {task}"] = env.render()[:300, :300]  # the scene alone
+    return sheet(tiles, 4)
 
 
-def portrait(tools: Sequence[Tool], spots: Sequence[tuple], size: int) -> np.ndarray:
-    """Tools at their spots (units), uint8 (size, size, 3): the middle 60 x 60 units of the world."""
-    canvas, edge = Canvas(round(1.4 * size), colour=True), round(0.2 * size)
-    for tool, (x, y) in zip(tools, spots, strict=True):
-        canvas.draw(strokes(tool, (x, y, 0.0)))
+def portrait(tools: Sequence[Tool], spots: Sequence[tuple], units: float, size: int) -> np.ndarray:
+    """Tools at their spots in so many units around the middle, uint8 (size, size, 3)."""
+    whole = round(size * WORLD / units)  # pixels
+    canvas, edge = Canvas(whole, colour=True), (whole - size) // 2
+    for tool, spot in zip(tools, spots, strict=True):
+        canvas.draw(strokes(tool, (*spot, 0.0)))
     return canvas.picture()[edge : edge + size, edge : edge + size]
 
 
 def tools_sheet() -> Image.Image:
     """Four tools of each class, and how many there are 15 degrees apart."""
-    labels, spots = action_labels()[IS_COARSE], [(27, 57), (57, 57), (27, 27), (57, 27)]
-    tiles, titles = [], []
+    labels, tiles = action_labels(), {}
     for label in dict.fromkeys(labels[1:].tolist()):
-        members = [tool for tool, its in zip(np.flatnonzero(IS_COARSE), labels) if its == label]
-        four = [TOOLS[members[int(share * len(members))]] for share in (0.98, 0.12, 0.45, 0.7)]
-        tiles.append(portrait(four, spots, 300))
-        titles.append(f"{label} ({len(members)})")
-    return sheet(tiles, titles, 5)
+        ids = np.flatnonzero((labels == label) & IS_COARSE)
+        four = [TOOLS[ids[int(share * len(ids))]] for share in (0.98, 0.12, 0.45, 0.7)]
+        spots = [(28, 56), (56, 56), (28, 28), (56, 28)]
+        tiles[f"{label} ({len(ids)})"] = portrait(four, spots, 60, 300)
+    return sheet(tiles, 5)
 
 
 def probe_sheet(name: str) -> Image.Image:
     """Probe-ball trajectories over tools, moved so that the tool stands in the middle."""
-    labels = action_labels()
+    labels, tiles = action_labels(), {}
     members = np.flatnonzero((np.char.lower(labels) == name.lower()) & IS_COARSE)
     if not (name.isdecimal() or len(members)):
         raise ValueError(
             f"unknown tool {name!r}: an id, or one of {', '.join(sorted(set(labels)))}"
         )
     ids = [int(name)] if name.isdecimal() else members[[len(members) * k // 10 for k in (1, 5, 9)]]
-    tiles = []
     for states, action in zip(action_observations(ids, 40, "state"), ids, strict=True):
         canvas = Canvas(420, colour=True)
         for k, path in enumerate(to_units(states[..., 2:4] - states[..., :2]).tolist()):
@@ -1501,59 +1425,60 @@ def probe_sheet(name: str) -> Image.Image:
             dots = [([point], 0.7 + 0.22 * age, None, hue) for age, point in enumerate(path)]
             canvas.draw([(path, 0.3, None, (*hue, 150)), *dots])
         canvas.draw(strokes(TOOLS[action], (WORLD / 2, WORLD / 2, 0.0)))
-        tiles.append(canvas.picture())
-    return sheet(tiles, [f"{labels[action]}, id {action}" for action in ids], len(ids))
+        tiles[f"{labels[action]}, id {action}"] = canvas.picture()[:420]
+    return sheet(tiles, len(ids))
 
 
 def play(env: CreateEnv, seed: int = 0) -> None:
-    """A window to play in: click on a tool (or arrow keys), click on the scene to place it, space
-    to wait. To the right is what the policy sees, the newest picture at the bottom.
+    """Place tools by mouse: click on a tool, then on the scene; space waits.
+
+    To the right is what the policy sees, the newest picture at the bottom.
     """
     import matplotlib.pyplot as plt  # here, so that no other command needs a display
 
-    columns, chosen, total, said = 5, 0, 0.0, ""
-    observation, _ = env.reset(seed=seed)
-    figure, panels = plt.subplots(1, 3, figsize=(13, 6), width_ratios=(2, 4, 1.4))
+    figure, (strip, scene) = plt.subplots(1, 2, figsize=(13, 6.5), width_ratios=(1, 2))
+    chosen, total, said = NO_OP, 0.0, ""
+    env.reset(seed=seed)
 
     def show() -> None:
-        tiles = [portrait([TOOLS[action]], [(42, 42)], 70) for action in env.available]
+        tiles = [portrait([TOOLS[action]], [(42, 42)], 36, 70) for action in env.available]
         tiles[chosen] = tiles[chosen] // 4 * 3  # in the shade
-        tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
-        strip = np.vstack(
-            [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
-        )
-        extents = (0, columns, len(tiles) // columns, 0), (0, WORLD, -CAPTION, WORLD), None
-        pictures = strip, env.render(), np.vstack(observation["state"])
-        titles = TOOLS[env.available[chosen]].kind, f"return {total:.2f} {said}", "the policy sees"
-        for axes, picture, extent, title in zip(panels, pictures, extents, titles, strict=True):
+        tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % 5)
+        rows = [np.hstack(tiles[k : k + 5]) for k in range(0, len(tiles), 5)]
+        picture, scale = env.render(), env.render_size / WORLD  # pixels per unit
+        for axes, image, extent, title in (
+            (strip, np.vstack(rows), (0, 5, len(rows), 0), TOOLS[env.available[chosen]].kind),
+            (
+                scene,
+                picture,
+                (0, picture.shape[1] / scale, -CAPTION, WORLD),
+                f"return {total:.2f}{said}",
+            ),
+        ):
             axes.clear()
-            axes.set_axis_off()
-            axes.set_title(title)
-            axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent)
+            axes.set(title=title, xticks=[], yticks=[])
+            axes.imshow(image, extent=extent)
         figure.canvas.draw_idle()
 
     def on_event(event) -> None:
-        nonlocal observation, chosen, total, said
-        key, place, action = getattr(event, "key", None), event.inaxes, None
-        ways = {"left": -1, "right": 1, "up": -columns, "down": columns}
-        if event.name == "key_press_event":
-            chosen = (chosen + ways.get(key, 0)) % env.num_available
-            action = {"choice": NO_OP, "position": (0, 0)} if key == " " else None
-        elif place is panels[0]:
-            chosen = min(int(event.ydata) * columns + int(event.xdata), env.num_available - 1)
-        elif place is panels[1]:
-            position = (event.xdata * 2 / WORLD - 1, event.ydata * 2 / WORLD - 1)
+        nonlocal chosen, total, said
+        where = event.inaxes if event.name == "button_press_event" else None
+        action = {"choice": NO_OP, "position": (0, 0)} if event.key == " " else None
+        if where is strip:
+            chosen = min(int(event.ydata) * 5 + int(event.xdata), env.num_available - 1)
+        elif where is scene and event.xdata < WORLD and event.ydata > 0:
+            position = event.xdata * 2 / WORLD - 1, event.ydata * 2 / WORLD - 1
             action = {"choice": chosen, "position": position}
         if action:
-            observation, reward, terminated, truncated, info = env.step(action)
+            _, reward, terminated, truncated, info = env.step(action)
             total, said = total + reward, ""
             if terminated or truncated:
-                said = f"at the end, {'goal' if info[METRIC] else 'no goal'}; the next episode:"
-                observation, total = env.reset()[0], 0.0
+                total, said = 0.0, f" (last: {total:.2f}, {'a' if info[METRIC] else 'no'} goal)"
+                env.reset()
         show()
 
-    for event in ("button_press_event", "key_press_event"):
-        figure.canvas.mpl_connect(event, on_event)
+    for name in ("button_press_event", "key_press_event"):
+        figure.canvas.mpl_connect(name, on_event)
     show()
     plt.show()
 
@@ -1580,10 +1505,10 @@ def main(args: Args) -> None:
     env = CreateEnv(task=args.task, render_mode="rgb_array")
     if args.play:
         return play(env, args.seed)
-    args.out.mkdir(parents=True, exist_ok=True)
     sheets = {"tasks": tasks_sheet} if args.all_tasks else {}
     sheets |= {"tools": tools_sheet} if args.show_tools else {}
     sheets |= {"probe": functools.partial(probe_sheet, args.show_probe)} if args.show_probe else {}
+    args.out.mkdir(parents=True, exist_ok=True)
     for name, draw in sheets.items():
         draw().save(args.out / f"create_{name}.png")
         print(f"wrote {args.out / f'create_{name}.png'}")
@@ -1593,11 +1518,10 @@ def main(args: Args) -> None:
         frames, total, length = play_episode(env, best)
         path = args.out / f"create_{args.task}.gif"
         save_gif(path, frames + frames[-1:] * 20, env.metadata["render_fps"])  # time to see the end
-        print(f"best of {args.tries} random episodes of {args.task}: seed {best}, {length} actions, "
-              f"return {total:.2f}; wrote {path}")  # fmt: skip
+        print(f"{args.task}, best of {args.tries} random episodes: seed {best}, {length} actions,")
+        print(f"return {total:.2f}; wrote {path}")
     for split in ("default", "full", "analysis"):
-        sizes = ", ".join(f"{part} {len(ids):,}" for part, ids in split_actions(split).items())
-        print(f"split {split:9} {sizes}")
+        print(split, "split:", {part: len(ids) for part, ids in split_actions(split).items()})
 
 
 if __name__ == "__main__":

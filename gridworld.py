@@ -212,8 +212,7 @@ class GridWorldEnv(gym.Env):
             available=gym.spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
         )
         self.action_space = gym.spaces.Discrete(num_available)
-        self.trace = []  # cells of the last skill, its start first; empty before the first reset
-        self.over = True  # nothing to step before the first reset
+        self.trace, self.over = [], True  # cells of the last skill; nothing to step yet
 
     def reset(self, *, seed=None, options=None):
         """Draw a layout and the skills on offer; returns (observation, {})."""
@@ -343,14 +342,12 @@ def draw_frame(env: GridWorldEnv, done: int) -> np.ndarray:
         x, y = column * CELL, row * CELL
         draw.rectangle((x, y, x + CELL, y + CELL), COLORS[kind], LINE, 4)
         for height in (48, 80, 112) if kind == LAVA else ():
-            wave = [(x + 16 + 32 * i, y + height - 8 * (-1) ** i) for i in range(5)]
-            draw.line(wave, WAVE, 8, "curve")
+            draw.line([(x + 16 + 32 * i, y + height - 8 * (-1) ** i) for i in range(5)], WAVE, 8)
         x, y = 1536 + column * 96, 416 + row * 96
         draw.rectangle((x - 48, y - 48, x + 48, y + 48), COLORS[EMPTY], LINE, 4)
         seen = AGENT if cell == env.trace[0] else kind
         draw.text((x, y), str(seen), DIM if seen in (EMPTY, WALL) else COLORS[seen], font, "mm")
-    path = [divmod(cell, SIZE) for cell in env.trace[: done + 1]]
-    path = (np.array(path) + 0.5) * CELL  # (done + 1, 2)
+    path = np.array([divmod(c, SIZE) for c in env.trace[: done + 1]]) * CELL + 80.0  # (done + 1, 2)
     draw.line(path.ravel().tolist(), TRAIL, 16, "curve")
     for x, y in path[:-1]:
         draw.ellipse((x - 20, y - 20, x + 20, y + 20), TRAIL)
@@ -372,8 +369,8 @@ def draw_frame(env: GridWorldEnv, done: int) -> np.ndarray:
 
 def draw_sheet(path: Path, pool: np.ndarray, seed: int) -> None:
     """One picture: the layouts, where skills lead, recordings of one skill of each quadrant."""
-    # An inherited backend (a notebook's) may not exist here; matplotlib would refuse its import.
-    os.environ["MPLBACKEND"] = "agg"
+    # An inherited backend (a notebook's) that is not installed would make the import fail.
+    os.environ.pop("MPLBACKEND", None)
     from matplotlib.figure import Figure  # here: training needs no pictures
 
     figure, labels = Figure((15, 6), layout="constrained"), action_labels()

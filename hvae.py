@@ -19,9 +19,6 @@ networks are trained on training actions only: unseen actions are encoded withou
     python hvae.py create --split full           # B; also --modality video; or: stacking
     python hvae.py gridworld --recipe paper      # Tables 3-4 to the letter: days on a CPU
     python hvae.py create --recipe quick --help  # the numbers of this environment and recipe
-
-Paper map: Tables 3-4 -> Args, TABLE_3, TABLE_4; D.3.1 -> the networks, in its order, from
-ConvEncoder to ConvDecoder; B -> HVAE, VAE, prepare; Figures 4-6 -> plot_tsne.
 """
 
 import colorsys
@@ -45,6 +42,9 @@ from tqdm import tqdm
 # Intel's MKL, which multiplies PyTorch's matrices, may add up the parts of its threads in the order
 # in which they come. In this mode the order is fixed: one seed, one run, bit for bit.
 os.environ.setdefault("MKL_CBWR", "AUTO")
+
+# Paper map: Tables 3-4 -> Args, TABLE_3, TABLE_4; D.3.1 -> the networks, in its order, from
+# ConvEncoder to ConvDecoder; B -> HVAE, VAE, prepare; Figures 4-6 -> plot_tsne.
 
 # Shapes: A actions in a batch, n observations of each, B = A * n, L states per trajectory (the
 # first is given, T = L - 1 are predicted), F numbers per state, C = Z sizes of c and z, H hidden
@@ -189,11 +189,9 @@ def check(args: Args) -> None:
 
 
 def prepare(raw: torch.Tensor, args: Args) -> tuple[torch.Tensor, torch.Tensor]:
-    """Raw observations (B, ...) -> what the encoder reads, what is to be reconstructed.
-
-    trajectory: (B, L, F), (B, T, F); one-hot: (B, L, 160), (B, T, 2) class numbers;
-    video: (B, L, 1, S, S), (B, T, 1, S, S); picture: twice (B, 1, 1, S, S).
-    """
+    """Raw observations (B, ...) -> what the encoder reads, what is to be reconstructed."""
+    # trajectory: (B, L, F), (B, T, F); one-hot: (B, L, 160), (B, T, 2) class numbers;
+    # video: (B, L, 1, S, S), (B, T, 1, S, S); picture: twice (B, 1, 1, S, S).
     raw = raw.float()
     if args.modality in VISUAL:
         frames = raw.unsqueeze(-3) / 255 - 0.5  # published code: greys to [-0.5, 0.5]
@@ -558,8 +556,9 @@ def observe(module, ids: np.ndarray, args: Args) -> np.ndarray:
 
 
 def fit(model: ObservationModel, data: np.ndarray, rows: np.ndarray, args: Args) -> list[dict]:
-    """Maximise the objective on data[rows], the raw observations (stored, ...) of each of the
-    training actions. Returns the losses of every update; ValueError if they diverge."""
+    """Maximise the objective on the observations data[rows] of the training actions.
+
+    Returns the losses of every update. Raises ValueError if they diverge."""
     device = next(model.parameters()).device
     # Ours: a free log-variance moves by about the learning rate per update, so it would take 10,000
     # updates from its start to the -9 of the released tables.
@@ -595,10 +594,9 @@ def fit(model: ObservationModel, data: np.ndarray, rows: np.ndarray, args: Args)
 
 @torch.no_grad()
 def embed(model: ObservationModel, data: np.ndarray, ids: np.ndarray, args: Args) -> np.ndarray:
-    """Representations of the actions `ids`, seen or not, from their raw observations `data`.
+    """Tables (3, NUM_ACTIONS, C) of the actions `ids`, from their raw observations `data`.
 
-    Returns (3, NUM_ACTIONS, C): from all observations, and from every other one, twice. Other
-    actions (CREATE has tools outside of every split) have 0, the mean of the prior.
+    The first is from all observations, the others from every second one. Other actions have 0.
     """
     device = next(model.parameters()).device
     model.eval()  # running statistics: a representation does not depend on its neighbours
@@ -638,8 +636,9 @@ def train(args: Args) -> Path:
         tables = embed(model, data, pool, args)
     torch.set_num_threads(threads)
     write(path.with_suffix(".pt"), lambda file: torch.save(model.cpu().state_dict(), file))
-    lines = [",".join(losses[0])] + [",".join(f"{v:.6g}" for v in row.values()) for row in losses]
-    write(path.with_suffix(".csv"), lambda file: file.write("\n".join(lines + [""]).encode()))
+    rows, names = [list(row.values()) for row in losses], ",".join(losses[0])
+    form = dict(fmt="%.6g", delimiter=",", header=names, comments="")
+    write(path.with_suffix(".csv"), lambda file: np.savetxt(file, rows, **form))
     config = {k: v for k, v in asdict(args).items() if k not in ("device", "runs_dir")}
     save_representation(path, tables[0], ids, config)
     report(path, tables, args)
@@ -650,8 +649,9 @@ def train(args: Args) -> Path:
 
 
 def representation_path(args: Args) -> Path:
-    """Where `train(args)` writes its table. A hash of what differs from the recipe is in the name:
-    a policy that asks for a recipe's table never finds an experiment's."""
+    """Where `train(args)` writes its table."""
+    # A hash of what differs from the recipe is in the name: a policy that asks for a recipe's table
+    # never finds an experiment's.
     model = ("hvae" if args.hierarchical else "vae") + "-all" * (args.train_on == "all")
     name = f"{args.env}-{args.modality}-{model}-{args.split}{args.split_seed}-{args.recipe}"
     default = asdict(default_args(args.env, args.recipe, args.modality))
@@ -693,9 +693,8 @@ def save_representation(path, mean: np.ndarray, action_ids: np.ndarray, config: 
 def load_representation(path, env: str, split: str = "default", split_seed: int = 0) -> dict:
     """Read a table and make sure that it belongs to this environment, action set and split.
 
-    Returns mean (NUM_ACTIONS, D) float32, action_ids int64, and config, a dict. A table whose
-    config names no split belongs to every split. Raises FileNotFoundError without a file, ValueError
-    if it is damaged or belongs elsewhere.
+    Returns mean (NUM_ACTIONS, D) float32, action_ids int64, and config, a dict.
+    Raises FileNotFoundError without a file, ValueError if it is damaged or belongs elsewhere.
     """
     module, path = load_environment(env), Path(path)
     path.stat()  # FileNotFoundError
@@ -710,6 +709,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
         raise ValueError(f"{path} belongs to {found!r}, not to {env!r}")
     if config.get("fingerprint") != fingerprint(module):
         raise ValueError(f"{path} belongs to another action set of {env}: make it again")
+    # A table of your own that names no split belongs to every split.
     for key, wanted in (("split", split), ("split_seed", split_seed)):
         if config.get(key, wanted) != wanted:
             raise ValueError(f"{path} has {key} {config[key]!r}, wanted {wanted!r}")
@@ -733,12 +733,7 @@ PUBLISHED = {  # scores of the released 10,000-epoch tables: net_r2, move_accura
 def probe(mean, train_ids, held_out_ids, env="gridworld", halves=None) -> dict[str, float]:
     """What a table tells: read-outs fitted on train actions, scored on held-out ones.
 
-    Grid World: net_r2 (linear read-out of the net displacement), move_accuracy (logistic read-outs
-    of the five moves, mean; chance 0.25), nn_net_match (share of held-out skills whose nearest
-    train skill has the same net displacement). All: nn_class (share of held-out actions whose
-    nearest other held-out action has the same label; chance_class: for a random one), engineered_r2
-    (linear read-out of those engineered features that vary), draw_noise (distance between `halves`,
-    two tables from disjoint observations, over that to the nearest train action, both RMS).
+    halves: two tables from disjoint observations, for `draw_noise`.
     """
     from scipy.spatial.distance import cdist
     from sklearn.linear_model import LogisticRegression, RidgeCV
@@ -749,7 +744,7 @@ def probe(mean, train_ids, held_out_ids, env="gridworld", halves=None) -> dict[s
     x = (mean - mean[train_ids].mean(0)) / np.where(spread > 1e-6, spread, 1)
     seen, new = x[train_ids], x[held_out_ids]
 
-    def linear(y: np.ndarray) -> float:
+    def linear(y: np.ndarray) -> float:  # R^2, mean over the features that vary
         y = y[:, (y[train_ids].std(0) > 1e-6) & (y[held_out_ids].std(0) > 1e-6)]
         predicted = RidgeCV(np.logspace(-4, 4, 17)).fit(seen, y[train_ids]).predict(new)
         return r2_score(y[held_out_ids], predicted.reshape(len(new), -1))
@@ -758,19 +753,28 @@ def probe(mean, train_ids, held_out_ids, env="gridworld", halves=None) -> dict[s
     if env == "gridworld":
         moves = np.arange(len(mean)) // 4 ** np.arange(5)[:, None] % 4  # A.1: (5, 1024) move ids
         net = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])[moves].sum(0)  # (1024, 2)
+        # Linear read-out of the net displacement.
+        scores["net_r2"] = linear(net)
+        # Logistic read-outs of the five moves, mean; by chance 0.25.
         hits = []
         for move in moves:
             model = LogisticRegression(max_iter=2000).fit(seen, move[train_ids])
             hits.append(model.score(new, move[held_out_ids]))
-        match = (net[train_ids][near.argmin(1)] == net[held_out_ids]).all(1)
-        scores = dict(net_r2=linear(net), move_accuracy=np.mean(hits), nn_net_match=match.mean())
+        scores["move_accuracy"] = np.mean(hits)
+        # Share of skills whose nearest train skill has the same net displacement.
+        match = net[train_ids][near.argmin(1)] == net[held_out_ids]
+        scores["nn_net_match"] = match.all(1).mean()
+    # Share of actions whose nearest other held-out action has the same label, as the eye sees it in
+    # Figures 4-6; and that for a random other one.
     labels = np.asarray(module.action_labels())[held_out_ids]
     gaps, same = cdist(mean[held_out_ids], mean[held_out_ids]), labels == labels[:, None]
     np.fill_diagonal(gaps, np.inf)
     scores["nn_class"] = same[np.arange(len(same)), gaps.argmin(1)].mean()
     scores["chance_class"] = (same.sum() - len(same)) / (len(same) ** 2 - len(same))
+    # Linear read-out of the engineered features.
     scores["engineered_r2"] = linear(np.asarray(module.engineered_representations()))
     if halves is not None:
+        # Distance between the two halves, over that to the nearest train action (both RMS).
         noise = ((halves[0] - halves[1])[held_out_ids] ** 2).sum(1).mean()
         scores["draw_noise"] = np.sqrt(noise / (near.min(1) ** 2).mean())
     return {key: round(float(value), 4) for key, value in scores.items()}

@@ -447,7 +447,7 @@ def main(args: Args) -> None:
     play(env, args.policy, np.random.default_rng([args.seed, 1]), seed=args.seed)
     print(episode_text(env))
     # ours: a picture every fifth event, and the last one for 1.5 s: time to see the outcome.
-    parts = [env.timeline[:n] for n in range(1, len(env.timeline), 5)]
+    parts = [env.timeline[:n] for n in range(5, len(env.timeline), 5)]
     frames = [draw_timeline(env.available, part) for part in parts]
     frames += [env.render()] * round(1.5 * env.metadata["render_fps"])
     save_gif(args.out / "recsys_episode.gif", frames, env.metadata["render_fps"])

@@ -358,10 +358,11 @@ class Bullet:
 
 
 @functools.cache
-def surface(family: Family) -> dict[str, list]:
-    """T triangles at scale 1, with three vertices and normals of their own each, for the pictures.
+def geometry(family: Family) -> tuple[list, dict[str, list]]:
+    """What Bullet gets of a family, at scale 1: its V corners, and T triangles for the pictures.
 
-    With the normal of its plane at all three corners a face is evenly bright, and edges are sharp.
+    Each triangle has vertices of its own, all with the normal of its plane: a face is evenly bright
+    and an edge is sharp.
     """
     # pybullet never frees a list of vertices that it was given. So each family's lists are made
     # once (meshScale does the rest): with new lists, an episode would leak 200 kB and more.
@@ -374,19 +375,14 @@ def surface(family: Family) -> dict[str, list]:
         b, c = np.where(inside_out, c, b), np.where(inside_out, b, c)
         vertices += np.stack([a, b, c], axis=1).reshape(-1, 3).tolist()  # (3 T, 3)
         normals += outward.repeat(3, axis=0).tolist()  # (3 T, 3)
-    return {"vertices": vertices, "normals": normals, "indices": list(range(len(vertices)))}
-
-
-@functools.cache
-def corners(family: Family) -> list[list[float]]:
-    """The points as a list, for the collision shape; one per family, as above."""
-    return family.points.tolist()
+    triangles = {"vertices": vertices, "normals": normals, "indices": list(range(len(vertices)))}
+    return family.points.tolist(), triangles
 
 
 def add_shape(bullet: Bullet, shape_id: int, origin: Sequence[float], rgb: Sequence[float]) -> int:
     """Put an upright shape's origin at a place in the world; returns Bullet's number of it."""
     family, scale, angle = SHAPES[shape_id]
-    zoom = {"meshScale": [scale] * 3}
+    (corners, triangles), zoom = geometry(family), {"meshScale": [scale] * 3}
     if family.kind == "sphere":
         solid = bullet.createCollisionShape(p.GEOM_SPHERE, radius=scale)
     elif family.kind in ("cylinder", "capsule"):
@@ -400,8 +396,8 @@ def add_shape(bullet: Bullet, shape_id: int, origin: Sequence[float], rgb: Seque
             collisionFramePositions=parts.mean(axis=1).tolist(),
         )
     else:  # Points only, Bullet makes the hull. With triangles it would fall through the table.
-        solid = bullet.createCollisionShape(p.GEOM_MESH, vertices=corners(family), **zoom)
-    look = bullet.createVisualShape(p.GEOM_MESH, **surface(family), **zoom, rgbaColor=(*rgb, 1))
+        solid = bullet.createCollisionShape(p.GEOM_MESH, vertices=corners, **zoom)
+    look = bullet.createVisualShape(p.GEOM_MESH, **triangles, **zoom, rgbaColor=(*rgb, 1))
     # The body's frame has its origin at the centre of mass and goes along the principal axes; this
     # is what getBasePositionAndOrientation tells later. The pose here is of the shape's own frame.
     com, axes, moments = mass_properties(family)
@@ -504,10 +500,8 @@ class StackingEnv(gym.Env):
 
     ## Episode End
     1. Termination: the stop action. 2. Truncation: the tenth action, repeats included. The last
-    step's info has `height`, that of the highest shape.
-
-    `action_space.sample()` stops in every second step: such an episode ends after 1.7 steps on
-    average. A random policy that does not stop:
+    step's info has `height`, that of the highest shape. As `action_space.sample()` stops with
+    probability .5, it ends an episode after 2 steps on average. A random policy that does not stop:
 
     >>> env = StackingEnv()
     >>> obs, info = env.reset(seed=0)
@@ -549,6 +543,7 @@ class StackingEnv(gym.Env):
         self.action_space = spaces.Dict(parts)
         # The simulation is made in the first reset, so in the worker process of a vector env.
         self._bullet: Bullet | None = None
+        self._frames: list[np.ndarray] = []  # colour pictures of the last reset or step
 
     def __reduce__(self) -> None:
         raise TypeError("a StackingEnv holds a running simulation: make a new one, do not copy it")
