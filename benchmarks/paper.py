@@ -23,7 +23,7 @@ import shlex
 import subprocess
 import sys
 from collections import defaultdict
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -315,38 +315,35 @@ def merge(path: Path, columns: list[str], key: list[str], rows: list[dict]) -> N
     with temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
-        order = sorted(table, key=lambda k: [part.zfill(12) for part in k])  # numbers by size
-        writer.writerows(table[k] for k in order)
+        order = sorted(table, key=lambda k: [part.zfill(9) * part.isdigit() or part for part in k])
+        writer.writerows(table[k] for k in order)  # numbers by size
     temporary.replace(path)
 
 
 # ---- running ----
 
-LOCKS: dict[Path, Lock] = defaultdict(Lock)  # one command at a time in a folder, and in a table
+LOCK = Lock()  # one at a time writes tables
 
 
-def run(job: Job, needs: list[Future], args: Args) -> bool:
+def run(job: Job, args: Args) -> bool:
     """Run a job unless it is finished, and write its scores; whether there are any."""
     log = job.folder.with_suffix(".log")
-    ready = all([need.result() for need in needs])  # waits for them
-    with LOCKS[job.folder]:
-        if ready and not score_rows(job):
-            _, *words = shlex.split(job.command)
-            words += ["--resume"] * (job.folder / "args.json").exists()
-            log.parent.mkdir(parents=True, exist_ok=True)
-            with log.open("a") as file:
-                subprocess.run([sys.executable, *words], stdout=file, stderr=subprocess.STDOUT)
-        found = ready and score_rows(job)
-    if not found:
+    if not score_rows(job):
+        begun = job.kind == "train" and (job.folder / "args.json").exists()
+        words = shlex.split(job.command)[1:] + ["--resume"] * begun
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("a") as file:
+            subprocess.run([sys.executable, *words], stdout=file, stderr=subprocess.STDOUT)
+    if not (found := score_rows(job)):
         print(f"  FAILED  {job.command}  (see {log})", flush=True)
         return False
-    name = job.figure + "-paper" * (args.recipe == "paper")
-    path = Path(args.results_dir) / f"{name}.csv"
-    with LOCKS[path]:
-        merge(path, COLUMNS, COLUMNS[:9], found)
+    with LOCK:
+        name = job.figure + "-paper" * (args.recipe == "paper")
+        merge(Path(args.results_dir) / f"{name}.csv", COLUMNS, COLUMNS[:9], found)
         if job.kind == "train":
-            merge(path.with_name(f"{name}_curves.csv"), CURVES, CURVES[:7], curve_rows(job))
-    print(f"{found[-1]['score']:8.3f}  {job.command}", flush=True)
+            path = Path(args.results_dir) / f"{name}_curves.csv"
+            merge(path, CURVES, CURVES[:7], curve_rows(job))
+        print(f"{found[-1]['score']:8.3f}  {job.command}", flush=True)
     return True
 
 
@@ -359,12 +356,15 @@ def main(args: Args) -> None:
         return
     left = sum(not score_rows(job) for job in jobs)  # a folder of another run is an error now
     print(f"{left} of {len(jobs)} commands to run", flush=True)
-    futures: dict[Job, Future] = {}
+    chains = defaultdict(list)  # one after the other: a training, all that starts from it
+    for job in jobs:
+        first = job
+        while first.needs:
+            first = first.needs[0]
+        chains[first.folder].append(job)
     with ThreadPoolExecutor(args.jobs) as pool:
-        for job in jobs:  # in order: no job waits for one that has not started
-            needs = [futures[need] for need in job.needs]
-            futures[job] = pool.submit(run, job, needs, args)
-    failed = sum(not future.result() for future in futures.values())
+        done = pool.map(lambda chain: [run(job, args) for job in chain], chains.values())
+        failed = sum(chain.count(False) for chain in done)
     if failed:
         raise SystemExit(f"error: {failed} of {len(jobs)} commands failed")
 

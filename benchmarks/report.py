@@ -15,7 +15,7 @@ import os
 import re
 import sys
 from collections import Counter, defaultdict
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from statistics import mean, pstdev
 
@@ -56,9 +56,10 @@ ENVIRONMENTS = {  # title, what a score is
     "create": ("CREATE", "success rate"),
     "stacking": ("Shape Stacking", "height"),
 }
-# Mean score of random play, `python benchmarks/throughput.py random_play`; tasks not listed: 0.
-CHANCE = {"gridworld": 0.003, "recsys": 0.155, "recsys_full": 0.155, "stacking": 1.6}
-CHANCE |= {"push": 0.016, "seesaw": 0.003}
+# Mean score of random play: `python benchmarks/throughput.py random_play`. Not listed: 0.
+CHANCE = {"gridworld": 0.003, "recsys": 0.156, "recsys_full": 0.156, "stacking": 1.6}
+CHANCE |= {"push": 0.016, "seesaw": 0.003, "navigate": 0.002, "buckets": 0.005, "cannon": 0.004}
+CHANCE |= {"collide": 0.008, "moving": 0.023, "ladder": 0.003, "basket": 0.011, "funnel": 0.022}
 ANALYSES = {  # figure -> its name in published_analyses.csv, what is varied
     "analysis-angle": ("angle", "least angle to a training tool, degrees"),
     "analysis-embedding": ("emb", "quantile of the distance to a training tool"),
@@ -72,6 +73,12 @@ SHOWN = {  # the methods of long tables; the pictures have all of them
     "fig8": ("ours",),
 }
 HEADS = {"train": "seen (published)", "test": "**unseen** (published)"}
+# The best that unseen actions allow, where it is known.
+CEILINGS = {env.replace("-", "_"): unseen for env, (_, unseen) in ppo_actiongen.CEILINGS.items()}
+PUBLISHED = {}  # the columns that name a row -> mean and standard deviation
+for file, key in (("results", "env task method phase"), ("analyses", "analysis task method x")):
+    for row in read(ROOT / f"results/published_{file}.csv"):
+        PUBLISHED[tuple(row[k] for k in key.split())] = float(row["mean"]), float(row["std"])
 RESULTS = ROOT / "results"
 
 # ---- scores ----
@@ -108,11 +115,6 @@ def places(cells: Cells) -> list[Place]:
     return [*dict.fromkeys(place for place, _ in cells)]
 
 
-def methods_of(cells: Cells) -> list[str]:
-    """Their methods, in the order of METHODS."""
-    return [name for name in METHODS if any(method == name for _, method in cells)]
-
-
 def title(place: Place) -> str:
     """How an environment and task are called."""
     return f"{ENVIRONMENTS[place[0]][0]} {place[1]}".strip()
@@ -123,17 +125,6 @@ def steps(place: Place) -> str:
     return f"{round(place[2] / 1e6, 2 if place[2] < 1e7 else 0):g}M" if place[2] else ""
 
 
-@cache
-def all_published() -> dict[tuple, tuple[float, float]]:
-    """Mean and standard deviation by the columns that name a row of the two published files."""
-    found = {}
-    for file, key in (("results", "env task method phase"), ("analyses", "analysis task method x")):
-        for row in read(ROOT / f"results/published_{file}.csv"):
-            key_of_row = tuple(row[k] for k in key.split())
-            found[key_of_row] = float(row["mean"]), float(row["std"])
-    return found
-
-
 def published(figure: str, place: Place, method: str, phase: str) -> tuple:
     """Published mean and standard deviation of one cell's phase; (None, None) without them."""
     key = *place[:2], method, phase
@@ -141,12 +132,7 @@ def published(figure: str, place: Place, method: str, phase: str) -> tuple:
         # Published distances are 0.5 .. 5 of another table: by rank, as our quantiles 0 .. 0.9 are.
         by_rank = f"{5 * tested(phase) + 0.5:.1f}" if "embedding" in figure else None
         key = ANALYSES[figure][0], place[1], method, by_rank or phase.split("=")[1]
-    return all_published().get(key, (None, None))
-
-
-def ceiling(place: Place) -> float | None:
-    """The best that unseen actions allow, where it is known."""
-    return ppo_actiongen.CEILINGS.get(place[0].replace("_", "-"), (None, None))[1]
+    return PUBLISHED.get(key, (None, None))
 
 
 def drop_not_learned(cells: Cells, errors: Cells) -> list[str]:
@@ -186,8 +172,8 @@ def table(figure: str, cells: Cells) -> str:
             line.append(f"{mean(ours):.3f}" if ours else "")
             line[-1] += f"±{pstdev(ours):.3f}" if len(ours) > 1 else ""
             line[-1] += f" ({theirs[0]:.3f})" if ours and theirs[0] is not None else ""
-        known = "test" in cell and ceiling(place) is not None
-        lines.append([*line, f"{ceiling(place):.3f}" if known else ""])
+        known = "test" in cell and place[0] in CEILINGS
+        lines.append([*line, f"{CEILINGS[place[0]]:.3f}" if known else ""])
     heads = [HEADS.get(p, p.split("=")[-1] if figure in ANALYSES else p) for p in phases]
     corner = ANALYSES.get(figure, (figure, " "))[1]
     return markdown([corner, "method", "steps", "seeds", *heads, "ceiling"], lines)
@@ -195,15 +181,15 @@ def table(figure: str, cells: Cells) -> str:
 
 def adaptation_table(curves: Cells, zero: dict[Place, float]) -> str:
     """Figure 9: steps on the unseen actions that it takes to reach what zero-shot has at once."""
-    lines = []
+    methods, lines = [*dict.fromkeys(method for _, method in curves)], []
     for place in places(curves):
         lines.append([title(place), f"{zero[place]:.3f}"])
-        for points in (curves.get((place, method), {}) for method in methods_of(curves)):
+        for points in (curves.get((place, method), {}) for method in methods):
             # One point may jump over the line; the mean of a point and the next four does not.
             y, x = [*map(mean, points.values())], [*map(int, points)]
             above = [s for i, s in enumerate(x[:-4]) if mean(y[i : i + 5]) > zero[place]]
             lines[-1].append(f"{above[0]:,}" if above else f"not in {x[-1]:,}" if x else "")
-    return markdown([" ", "zero-shot", *(METHODS[m][0] for m in methods_of(curves))], lines)
+    return markdown([" ", "zero-shot", *(METHODS[m][0] for m in methods)], lines)
 
 
 # ---- pictures ----
@@ -246,7 +232,7 @@ def draw_bars(path: Path, cells: Cells) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    methods, count = methods_of(cells), len(places(cells))
+    methods, count = sorted({m for _, m in cells}, key=[*METHODS].index), len(places(cells))
     width, height = 3.3 if count > 1 else 6.5, 0.32 * len(methods) + 0.7
     figure, axes = canvas(count, 3, width, height, sharey=True)
     outline, line = dict(fill=False, edgecolor="0.2", lw=0.9), dict(color="0.5", lw=0.8, ls="--")
@@ -260,8 +246,8 @@ def draw_bars(path: Path, cells: Cells) -> None:
                 axis.barh(at, mean(ours), 0.36, color=METHODS[method][1], alpha=alpha)
                 axis.plot(ours, [at] * len(ours), ".", color="black", ms=3, zorder=3)
                 axis.barh(at, published("", place, method, phase)[0] or 0, 0.36, **outline)
-        if ceiling(place) is not None:
-            key["ceiling, unseen"] = axis.axvline(ceiling(place), **line)
+        if place[0] in CEILINGS:
+            key["ceiling, unseen"] = axis.axvline(CEILINGS[place[0]], **line)
         axis.set(title=f"{title(place)}, {steps(place)} steps", xlabel=ENVIRONMENTS[place[0]][1])
     axes[0].set_yticks(range(len(methods)), [METHODS[m][0] for m in methods])
     axes[0].invert_yaxis()
