@@ -97,11 +97,9 @@ MODALITIES = ("xy", "state", "video")  # B: (x, y) of the ball is the default
 
 # ---- A.3 actions: the tools ----
 
-# Collision types: pairs of them have rules (`make_space`). MOVING: balls and loose boxes.
-NAMES = "PLAIN MOVING CANNON FAN BELT LADDER FUNNEL BUCKET PLANK GOAL"
-Contact = enum.IntEnum("Contact", NAMES, start=0)
-# Balls pass through these; only their rule acts.
-SENSORS = (Contact.CANNON, Contact.FAN, Contact.BELT, Contact.LADDER, Contact.GOAL)
+# Collision types: pairs of them have rules (`make_space`). MOVING are balls and loose boxes. Balls
+# pass through shapes from GOAL on, only the rule acts.
+Contact = enum.IntEnum("Contact", "PLAIN MOVING PLANK FUNNEL BUCKET GOAL CANNON FAN BELT LADDER")
 
 
 class Tool(NamedTuple):
@@ -519,6 +517,7 @@ FIRST_CORNER = {"Funnel": 30, "Bucket": 45}  # published code, degrees at tool a
 NO_OP_RADIUS = 0.1 * math.sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
+@functools.cache
 def outline(tool: Tool) -> list[tuple[float, float]]:
     """Corners of an object, or ends of its line, around its place; discs have none.
 
@@ -600,7 +599,7 @@ def build(tool: Tool, x: float, y: float, static_body: pymunk.Body) -> Thing:
             joints.append(pymunk.GearJoint(body, weight, 0.0, 1.0))
     else:
         shape = pymunk.Poly(body, thing.corners)
-    shape.collision_type, shape.sensor = int(kind.contact), kind.contact in SENSORS
+    shape.collision_type, shape.sensor = int(kind.contact), kind.contact >= Contact.GOAL
     # The contact law multiplies both numbers of the two shapes; a ball's are 1.
     shape.elasticity = VESSEL_ELASTICITY if family == "vessel" else float(tool.elasticity)
     # published code: never sets the friction of ball tools and planks, which leaves it at 0
@@ -871,7 +870,7 @@ def _look_vessel(tool, kind, colour, corners, at):  # funnel and bucket
 
 LOOKS = {"disc": _look_round, "ball": _look_round, "polygon": _look_flat, "crate": _look_flat}
 LOOKS |= {"segment": _look_bar, "plank": _look_plank, "box": _look_box, "vessel": _look_vessel}
-FINE_GREY, FINE_COLOUR = 4, 3  # ours: drawn so many times too large and averaged: soft edges
+FINE = 3  # ours: drawn so many times too large and averaged, for soft edges and small moves
 CAPTION = 6.0  # ours, units: room under the colour picture for a line of words
 
 
@@ -879,11 +878,10 @@ class Canvas:
     """A picture of the world, in grey (size x size) or in colour with room for a caption."""
 
     def __init__(self, size: int, colour: bool = False):
-        self.colour, self.fine = colour, FINE_COLOUR if colour else FINE_GREY
-        self.scale = size * self.fine / WORLD  # fine pixels per unit
+        self.colour, self.scale = colour, size * FINE / WORLD  # fine pixels per unit
         height = size + colour * round(size * CAPTION / WORLD)
         mode, paper = ("RGB", PAPER) if colour else ("L", 255)  # the observation is on white
-        self.image = Image.new(mode, (size * self.fine, height * self.fine), paper)
+        self.image = Image.new(mode, (size * FINE, height * FINE), paper)
         for v in np.arange(1, 8) * WORLD / 8 if colour else ():
             grid = ([(v, 0), (v, WORLD)], [(0, v), (WORLD, v)])
             self.draw([(points, 0.12, None, "#f1efe8") for points in grid])
@@ -900,7 +898,7 @@ class Canvas:
             ink = colour if self.colour else grey
             if ink is None:
                 continue
-            # Pillow rounds to fine pixels: in the observation a ball moves in quarters of a unit.
+            # Pillow rounds to fine pixels: in the observation a ball moves in thirds of a unit.
             pixels = [(x * self.scale, (WORLD - y) * self.scale) for x, y in points]
             pixels += pixels[:1] if width < 0 else []
             wide = max(1, round(abs(width) * self.scale))
@@ -915,7 +913,7 @@ class Canvas:
 
     def picture(self) -> np.ndarray:
         """uint8 (size, size) grey, or (height, size, 3) in colour."""
-        return np.array(self.image.reduce(self.fine))
+        return np.array(self.image.reduce(FINE))
 
 
 # ---- A.3 the environment ----
@@ -1092,8 +1090,8 @@ class CreateEnv(gym.Env):
         moved = False
         if not self._target_hit:
             # in shares of the screen's diagonal; who has left the screen counts at its edge
-            ways = np.clip((self._target.pose()[:2], self._start), 0, WORLD)
-            far = math.dist(*ways) > HIT_DISTANCE * WORLD * math.sqrt(2)
+            now = [min(max(value, 0.0), WORLD) for value in self._target.body.position]
+            far = math.dist(now, self._start) > HIT_DISTANCE * WORLD * math.sqrt(2)
             moved = far and (self._marker.touched or not self.task.marker_must_hit)
             self._target_hit = moved
         # published code: tests the goal before the target hit and never forgets a touch, so a goal
@@ -1322,8 +1320,7 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
 def _film(tool: Tool, states: np.ndarray) -> np.ndarray:
     """One tool's trajectories (n, 7, 7) as pictures, uint8 (n, 7, 48, 48).
 
-    B: "collected identically as the state case, only the modality changes". So the camera sees the
-    whole scene, with the tool where it stands.
+    B: "collected identically as the state case, only the modality changes": the whole scene.
     """
     blank, video = Canvas(PROBE_VIDEO), np.empty((*states.shape[:2], 48, 48), np.uint8)
     for frame_at in np.ndindex(states.shape[:2]):
@@ -1350,18 +1347,18 @@ def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None
     temporary.replace(path)
 
 
-def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, int]:
-    """A random episode: (frames, return, length). A tool is tried on half the steps."""
-    rng, total, length, over = np.random.default_rng(seed), 0.0, 0, False
+def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float]:
+    """A random episode: (frames, return). A tool is tried on half the steps."""
+    rng, total, over = np.random.default_rng(seed), 0.0, False
     env.reset(seed=seed)
     frames = env.render_frames()
     while not over:
         choice = int(rng.integers(env.num_available)) if rng.random() < 0.5 else NO_OP
         action = {"choice": choice, "position": rng.uniform(-0.9, 0.9, 2)}
         _, reward, terminated, truncated, _ = env.step(action)
-        total, length, over = total + reward, length + 1, terminated or truncated
+        total, over = total + reward, terminated or truncated
         frames = frames + env.render_frames()
-    return frames, total, length
+    return frames, total
 
 
 def sheet(tiles: dict[str, np.ndarray], columns: int) -> Image.Image:
@@ -1414,9 +1411,7 @@ def probe_sheet(name: str) -> Image.Image:
     labels, tiles = action_labels(), {}
     members = np.flatnonzero((np.char.lower(labels) == name.lower()) & IS_COARSE)
     if not (name.isdecimal() or len(members)):
-        raise ValueError(
-            f"unknown tool {name!r}: an id, or one of {', '.join(sorted(set(labels)))}"
-        )
+        raise ValueError(f"unknown tool {name!r}; classes: {', '.join(sorted(set(labels)))}")
     ids = [int(name)] if name.isdecimal() else members[[len(members) * k // 10 for k in (1, 5, 9)]]
     for states, action in zip(action_observations(ids, 40, "state"), ids, strict=True):
         canvas = Canvas(420, colour=True)
@@ -1445,19 +1440,13 @@ def play(env: CreateEnv, seed: int = 0) -> None:
         tiles[chosen] = tiles[chosen] // 4 * 3  # in the shade
         tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % 5)
         rows = [np.hstack(tiles[k : k + 5]) for k in range(0, len(tiles), 5)]
-        picture, scale = env.render(), env.render_size / WORLD  # pixels per unit
-        for axes, image, extent, title in (
-            (strip, np.vstack(rows), (0, 5, len(rows), 0), TOOLS[env.available[chosen]].kind),
-            (
-                scene,
-                picture,
-                (0, picture.shape[1] / scale, -CAPTION, WORLD),
-                f"return {total:.2f}{said}",
-            ),
-        ):
+        picture, unit = env.render(), env.render_size / WORLD  # pixels
+        for axes in (strip, scene):
             axes.clear()
-            axes.set(title=title, xticks=[], yticks=[])
-            axes.imshow(image, extent=extent)
+        strip.imshow(np.vstack(rows), extent=(0, 5, len(rows), 0))
+        scene.imshow(picture, extent=(0, picture.shape[1] / unit, -CAPTION, WORLD))
+        strip.set(title=TOOLS[env.available[chosen]].kind, xticks=[], yticks=[])
+        scene.set(title=f"return {total:.2f}{said}", xticks=[], yticks=[])
         figure.canvas.draw_idle()
 
     def on_event(event) -> None:
@@ -1513,15 +1502,12 @@ def main(args: Args) -> None:
         draw().save(args.out / f"create_{name}.png")
         print(f"wrote {args.out / f'create_{name}.png'}")
     if not sheets:
-        seeds, blind = range(args.seed, args.seed + args.tries), CreateEnv(task=args.task)
+        seeds, blind = range(args.seed, args.seed + max(1, args.tries)), CreateEnv(task=args.task)
         best = max(seeds, key=lambda seed: play_episode(blind, seed)[1])
-        frames, total, length = play_episode(env, best)
+        frames, total = play_episode(env, best)
         path = args.out / f"create_{args.task}.gif"
         save_gif(path, frames + frames[-1:] * 20, env.metadata["render_fps"])  # time to see the end
-        print(f"{args.task}, best of {args.tries} random episodes: seed {best}, {length} actions,")
-        print(f"return {total:.2f}; wrote {path}")
-    for split in ("default", "full", "analysis"):
-        print(split, "split:", {part: len(ids) for part, ids in split_actions(split).items()})
+        print(f"best of {args.tries} episodes: seed {best}, return {total:.2f}; wrote {path}")
 
 
 if __name__ == "__main__":
