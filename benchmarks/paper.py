@@ -37,7 +37,6 @@ sys.path.insert(0, str(ROOT))
 import hvae  # noqa: E402
 import ppo_actiongen  # noqa: E402
 
-# ---- the matrix ----
 # Rows have the names of results/published_results.csv, so that ours and published scores join. A
 # row holds its method's own flags and nothing else: no tuning of one recipe, so that --recipe paper
 # is Tables 3 and 4 but for these flags.
@@ -159,9 +158,6 @@ class Args:
     results_dir: str = "results"  # where the tables go
 
 
-# ---- from rows to commands ----
-
-
 @dataclass(eq=False)  # a job equals itself only
 class Job:
     """One row of TABLE for one seed."""
@@ -235,8 +231,6 @@ def plan(args: Args) -> list[Job]:
         raise ValueError(f"no row is called {' or '.join(args.only)}: see --dry-run")
     return list(jobs.values())
 
-
-# ---- from finished jobs to tables ----
 
 COLUMNS = "env task method seed split split_seed recipe steps phase".split()  # a row's key
 COLUMNS += "score stderr episodes pool_size hours machine command".split()
@@ -319,8 +313,6 @@ def merge(path: Path, columns: list[str], key: list[str], rows: list[dict]) -> N
         writer.writerows(table[k] for k in order)  # numbers by size
     temporary.replace(path)
 
-
-# ---- running ----
 
 LOCK = Lock()  # one at a time writes tables
 

@@ -68,10 +68,8 @@ ANALYSES = {  # figure -> its name in published_analyses.csv, what is varied
 }
 MAIN = ("gridworld", "recsys", "create-push", "stacking")  # the figures of the summary
 FIGURE_14 = ("gridworld", "recsys", "fig12", *(f"create-{t}" for t in paper.CREATE), "stacking")
-SHOWN = {  # the methods of long tables; the pictures have all of them
-    "main": ("ours", "ours_bilinear", "engineered", "nearest_neighbor", "continuous_output"),
-    "fig8": ("ours",),
-}
+SUMMARY = ("ours", "ours_bilinear", "engineered", "nearest_neighbor", "continuous_output")
+SHOWN = {"main": SUMMARY, "fig8": ("ours",)}  # of long tables; the pictures have all methods
 HEADS = {"train": "seen (published)", "test": "**unseen** (published)"}
 # The best that unseen actions allow, where it is known.
 CEILINGS = {env.replace("-", "_"): unseen for env, (_, unseen) in ppo_actiongen.CEILINGS.items()}
@@ -80,8 +78,6 @@ for file, key in (("results", "env task method phase"), ("analyses", "analysis t
     for row in read(ROOT / f"results/published_{file}.csv"):
         PUBLISHED[tuple(row[k] for k in key.split())] = float(row["mean"]), float(row["std"])
 RESULTS = ROOT / "results"
-
-# ---- scores ----
 
 Place = tuple[str, str, int]  # env, task ("" without one), number of steps
 Cells = dict[tuple[Place, str], dict[str, list[float]]]  # place, method -> phase -> its seeds
@@ -149,9 +145,6 @@ def drop_not_learned(cells: Cells, errors: Cells) -> list[str]:
     return [f"{about}: {', '.join(labels)}." for about, labels in failed.items()]
 
 
-# ---- tables ----
-
-
 def markdown(head: list[str], lines: list[list[str]]) -> str:
     """A table, without the columns in which nothing stands; "" without lines."""
     keep = [i for i in range(len(head)) if any(line[i] for line in lines)]
@@ -190,9 +183,6 @@ def adaptation_table(curves: Cells, zero: dict[Place, float]) -> str:
             above = [s for i, s in enumerate(x[:-4]) if mean(y[i : i + 5]) > zero[place]]
             lines[-1].append(f"{above[0]:,}" if above else f"not in {x[-1]:,}" if x else "")
     return markdown([" ", "zero-shot", *(METHODS[m][0] for m in methods)], lines)
-
-
-# ---- pictures ----
 
 
 def canvas(count: int, columns: int, width: float, height: float, **options):
@@ -321,9 +311,6 @@ def draw_embeddings(path: Path, figure: str) -> None:
             key[label] = axis.scatter(*spots[labels == label].T, color=color, **look)
         axis.set(title=name, xticks=[], yticks=[])
     save(picture, path, key, 7)
-
-
-# ---- pages ----
 
 
 def section(name: str, draw: bool) -> str:

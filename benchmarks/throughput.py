@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads that share a core wait for each other
@@ -28,18 +29,21 @@ CLASSES |= {"stacking_env": "StackingEnv"}
 TASKS = "push navigate obstacle seesaw belt buckets cannon collide moving ladder basket funnel"
 
 
-def compare(what: str, unit: str, works: dict[str, Callable[[], int]], seconds=6.0) -> None:
-    """Print the ratio of two rates; the works take turns, each returns how many units it did."""
-    done, spent = dict.fromkeys(works, 0), dict.fromkeys(works, 0.0)
+def compare(what: str, count: int, works: dict[str, Callable], seconds=6.0) -> None:
+    """Print the ratio of the rates of two works, which take turns; each does `count` units."""
+    calls, spent = 0, dict.fromkeys(works, 0.0)
     for work in works.values():
         work()  # memory, caches, first resets
     while min(spent.values()) < seconds:
+        calls += 1
         for name, work in works.items():
             start = time.perf_counter()
-            done[name] += work()
+            work()
             spent[name] += time.perf_counter() - start
-    (a, fast), (b, slow) = [(name, done[name] / spent[name]) for name in works]
-    print(f"{what}: {a} : {b} = {fast / slow:.2f}   ({fast:,.0f} : {slow:,.0f} {unit})", flush=True)
+    fast, slow = (calls * count / t for t in spent.values())
+    print(
+        f"{what}: {' : '.join(works)} = {fast / slow:.2f}   ({fast:,.0f} : {slow:,.0f} per second)"
+    )
 
 
 def make_env(name: str, **options):
@@ -65,48 +69,42 @@ def play(env, actions, steps: int, metric: str = "") -> list[float]:
     return scores
 
 
-# ---- groups: one function each ----
-
-
 def environments() -> None:
-    """32 environments in gymnasium's vector environment, against one alone."""
+    """32 environments in gymnasium's vector environment, against one alone: steps."""
     for name in CLASSES:
         module, env, actions = make_env(name)
         envs = module.make_vec(32, module.split_actions()["train"], seed=0)
         envs.reset()
-        batch = itertools.cycle([envs.action_space.sample() for _ in range(100)])
-
-        def vector(envs=envs, batch=batch) -> int:
-            return len(envs.step(next(batch))[1])
-
-        def alone(env=env, actions=actions) -> int:
-            play(env, actions, 32)
-            return 32
-
-        compare(name, "steps/s", {"vector": vector, "alone": alone})
+        batches = itertools.cycle([envs.action_space.sample() for _ in range(100)])
+        vector = partial(lambda envs, batches: envs.step(next(batches)), envs, batches)
+        compare(name, 32, {"vector": vector, "alone": partial(play, env, actions, 32)})
         envs.close()
         env.close()
 
 
 def physics() -> None:
-    """Shape Stacking: until all shapes are at rest, against 300 exact steps after each action."""
+    """Shape Stacking until all shapes are at rest, against 300 exact steps each: actions."""
     module, env, actions = make_env("stacking_env")
-    ours = module.SOLVER_RESIDUAL
 
-    def run(early_stop: bool, residual: float) -> int:
+    def work(early_stop: bool, residual: float) -> None:
         env.early_stop, module.SOLVER_RESIDUAL = early_stop, residual
         play(env, actions, 20)
-        return 20
 
-    works = {"ours": lambda: run(True, ours), "plain": lambda: run(False, 1e-7)}  # Bullet's own
-    compare("stacking", "steps/s", works, 20.0)
+    ours, plain = (
+        partial(work, True, module.SOLVER_RESIDUAL),
+        partial(work, False, 1e-7),
+    )  # Bullet's
+    compare("stacking", 20, {"ours": ours, "plain": plain}, 20.0)
 
 
 def utility() -> None:
-    """Utility's own backward pass against autograd's, one minibatch forward and backward."""
+    """Utility's own backward pass against autograd's, a minibatch there and back: states."""
     import torch
 
-    from ppo_actiongen import Utility
+    import ppo_actiongen as ppo
+
+    def work(form: Callable, *inputs) -> None:
+        form(*inputs).square().mean().backward()
 
     torch.set_num_threads(1)
     for name, B, K, A in (
@@ -114,18 +112,10 @@ def utility() -> None:
         ("Grid World, paper", 4096, 50, 1024),
         ("Recommender, paper", 2048, 500, 10_000),
     ):
-        u, P, w = (torch.randn(*shape, requires_grad=True) for shape in ((B, 64), (A, 64), (64,)))
-        sets = torch.stack([torch.randperm(A)[:K] for _ in range(B)])  # (B, K)
-
-        def kernel(u=u, P=P, w=w, sets=sets) -> int:
-            Utility.apply(u, P, w, sets).square().mean().backward()
-            return len(sets)
-
-        def plain(u=u, P=P, w=w, sets=sets) -> int:
-            ((P[sets] + u[:, None]).relu() @ w).square().mean().backward()  # (B, K)
-            return len(sets)
-
-        compare(f"{name}, K={K}", "states/s", {"kernel": kernel, "autograd": plain})
+        inputs = [torch.randn(*n, requires_grad=True) for n in ((B, 64), (A, 64), (64,))]
+        inputs.append(torch.stack([torch.randperm(A)[:K] for _ in range(B)]))
+        works = {"kernel": ppo.Utility.apply, "autograd": ppo.utility}
+        compare(name, B, {key: partial(work, form, *inputs) for key, form in works.items()})
 
 
 def learner() -> None:
