@@ -85,7 +85,8 @@ Cells = dict[tuple[Place, str], dict[str, list[float]]]  # place, method -> phas
 
 def tested(phase: str) -> float:
     """The number in a phase: 15 of min-angle-gap=15, 0.5 of ...=q0.5, a step; 0 without one."""
-    return float(re.search(r"[\d.]*$", phase)[0] or 0)
+    found = re.search(r"(?:^|=q?)([\d.]+)$", phase)
+    return float(found[1]) if found else 0.0
 
 
 def group(rows: list[dict], phase: str = "phase", column: str = "score") -> Cells:
@@ -142,7 +143,7 @@ def drop_not_learned(cells: Cells, errors: Cells) -> list[str]:
             del cells[place, method]
             about = f"{title(place)}, not learned at {steps(place)} steps (random play: {chance:g})"
             failed[about].append(METHODS[method][0])
-    return [f"{about}: {', '.join(labels)}." for about, labels in failed.items()]
+    return [f"{about}: {'; '.join(labels)}." for about, labels in failed.items()]
 
 
 def markdown(head: list[str], lines: list[list[str]]) -> str:
@@ -154,14 +155,15 @@ def markdown(head: list[str], lines: list[list[str]]) -> str:
 
 def table(figure: str, cells: Cells) -> str:
     """One row per environment and method, one column per phase; published means in brackets."""
-    phases = dict.fromkeys(phase for cell in cells.values() for phase in cell)
+    phases = dict.fromkeys(p for cell in cells.values() for p in cell if ", published" not in p)
     phases = sorted(phases, key=lambda phase: [*HEADS, phase].index(phase))  # seen, unseen, others
     lines = []
     for (place, method), cell in cells.items():
         line = [title(place) * (len(places(cells)) > 1), METHODS[method][0], steps(place)]
         line.append(str(max(map(len, cell.values()))))
         for phase in phases:
-            ours, theirs = cell.get(phase, []), published(figure, place, method, phase)
+            theirs = cell.get(f"{phase}, published") or published(figure, place, method, phase)
+            ours = cell.get(phase, [])
             line.append(f"{mean(ours):.3f}" if ours else "")
             line[-1] += f"±{pstdev(ours):.3f}" if len(ours) > 1 else ""
             line[-1] += f" ({theirs[0]:.3f})" if ours and theirs[0] is not None else ""
@@ -288,8 +290,9 @@ def draw_embeddings(path: Path, figure: str) -> None:
     from sklearn.manifold import TSNE
 
     panels = {}  # label -> representations and labels of unseen actions
+    args = paper.Args((figure,), recipe="paper" if path.stem.endswith("-paper") else "fast")
     for row in TABLE[figure]:
-        job = paper.expand(figure, row, 0, paper.Args((figure,)))
+        job = paper.expand(figure, row, 0, args)
         module = hvae.load_environment(job.args.env)
         split = module.split_actions(job.args.split, job.args.split_seed)
         unseen = np.setdiff1d([*split["valid"], *split["test"]], split["train"])
@@ -343,15 +346,13 @@ def section(name: str, draw: bool) -> str:
     else:
         rows = [row for row in rows if row["phase"] != "valid"]
         cells = group(rows)
-        notes, some = (
-            drop_not_learned(cells, group(rows, column="stderr")),
-            SHOWN.get(name, METHODS),
-        )
-        text = table(name, {key: cell for key, cell in cells.items() if key[1] in some})
-        picture = partial(draw_bars, path, cells)
-    if draw and text + str(notes) and name not in ("main", "quick"):
+        notes = drop_not_learned(cells, group(rows, column="stderr"))
+        some = {k: cell for k, cell in cells.items() if k[1] in SHOWN.get(name, METHODS)}
+        text, drawn = table(name, some), cells and name not in ("main", "quick")
+        picture = partial(draw_bars, path, cells) if drawn else None
+    if draw and picture:
         picture()
-    image = f"![{name}]({{folder}}{name}.png)" if path.exists() else ""
+    image = f"![{name}]({{folder}}{name}.png)" if picture and path.exists() else ""
     return "\n\n".join(filter(None, [text, *notes, image])) + "\n"
 
 
@@ -361,7 +362,8 @@ def main(check: bool = False) -> None:
     Args:
         check: change nothing, exit 1 where a page disagrees with the CSV files.
     """
-    names = ["main", *TABLE, *(f"{figure}-paper" for figure in TABLE), "fig14"]
+    figures = [name for name in TABLE if name != "analysis"]  # no result of its own
+    names = ["main", *figures, *(f"{name}-paper" for name in figures), "fig14"]
     contents = {name: section(name, not check) for name in names}
     for page, folder in ((RESULTS / "README.md", ""), (RESULTS.parent / "README.md", "results/")):
         text = page.read_text() if page.exists() else ""
@@ -371,9 +373,7 @@ def main(check: bool = False) -> None:
             marks = re.compile(rf"(<!-- begin:{name} -->\n).*?(<!-- end:{name} -->)", re.S)
             new = marks.sub(lambda m, content=content: m[1] + content + m[2], new)
         if check and new != text:
-            raise SystemExit(
-                f"error: run benchmarks/report.py: {page} disagrees with the CSV files"
-            )
+            raise SystemExit(f"error: {page} disagrees with the CSV files: run report.py")
         if new != text:
             page.write_text(new)
 
