@@ -29,19 +29,19 @@ Paper map (appendix)                                here, in this order
   Algorithm 2: acting with new actions              evaluate
   A.3 analyses                                      restrict_pool
 
-Letters in shape comments: T rollout steps, N environments, B = T * N (or rows of a minibatch),
-K actions on offer, D size of a representation, H hidden units, A rows of the table, n of them
-trained on.
+Letters in shape comments: T rollout steps, N environments, B rows of a batch, K actions on offer,
+D size of a representation, H hidden units, A rows of the table, n of them trained on.
 """
 
 import csv
+import ctypes
 import json
 import math
 import os
 import shlex
 import sys
 import time
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -134,42 +134,30 @@ class Args:
     def __post_init__(self):
         self.adapt = self.adapt or self.finetune is not None
 
+    @property
+    def one_set(self) -> bool:
+        """Whether every episode of the training offers the same actions."""
+        return self.method == "nearest-neighbor" or self.adapt or not self.subsample
 
-# Table 3, a column per environment; what is the same as above is not repeated.
+
+TABLE_3 = {  # a column per environment: gridworld, recsys, create, stacking
+    "ent_coef": (0.05, 0.01, 0.005, 0.01),
+    "num_available": (50, 500, 50, 20),
+    "total_timesteps": (40_000_000, 40_000_000, 60_000_000, 3_000_000),
+    "minibatch_size": (4096, 2048, 3072, 1024),
+    # What else is not the same in all of them (A.2, B, C.6, published code).
+    "representation": ("hvae", "engineered", "hvae", "hvae"),  # A.2: recsys provides them
+    "modality": ("xy", None, "xy", "image"),
+    "task": (None, None, "push", None),
+    "placement": (None, None, None, "1d"),
+    "lr_decay_steps": (None, None, 100_000_000, 100_000_000),  # longer than the run
+    "fixed_set_size": (None, 2000, None, None),  # for the cost of all 5,000
+    "eval_every": (410_000, 164_000, 615_000, 102_400),  # 25, 20, 50, 25 updates
+    "valid_episodes": (640, 160, 640, 200),  # stacking, published code: 40, too few to choose by
+}
 PRESETS = {
-    "gridworld": Args("gridworld", modality="xy"),
-    "recsys": Args(
-        "recsys",
-        representation="engineered",  # A.2: the environment provides them
-        ent_coef=0.01,
-        num_available=500,
-        minibatch_size=2048,
-        fixed_set_size=2000,  # published code, for the cost of the whole set
-        eval_every=164_000,  # published code: 20 updates
-        valid_episodes=160,  # published code: 20 x 8
-    ),
-    "create": Args(
-        "create",
-        modality="xy",
-        task="push",
-        ent_coef=0.005,
-        total_timesteps=60_000_000,
-        minibatch_size=3072,
-        lr_decay_steps=100_000_000,  # appendix: silent; published code: longer than the run
-        eval_every=615_000,  # published code: 50 updates
-    ),
-    "stacking": Args(
-        "stacking",
-        modality="image",
-        placement="1d",
-        ent_coef=0.01,
-        num_available=20,
-        total_timesteps=3_000_000,
-        minibatch_size=1024,
-        lr_decay_steps=100_000_000,  # as in CREATE
-        eval_every=102_400,  # published code: 25 updates
-        valid_episodes=200,  # published code: 40; ours: too few to choose by
-    ),
+    env: Args(env, **{flag: column[i] for flag, column in TABLE_3.items()})
+    for i, env in enumerate(("gridworld", "recsys", "create", "stacking"))
 }
 
 # Our recipe: every difference from Tables 3 and 4, with its reason.
@@ -292,7 +280,8 @@ def as_ink(frames: torch.Tensor) -> torch.Tensor:
     As it comes, white adds the same large number to every feature. Frames from before the episode
     began are black all over; they turn to zero, too.
     """
-    ink = 255 - F.avg_pool2d(frames.float(), 2)  # (N, C, 42, 42)
+    rows = frames[:, :, ::2].float() + frames[:, :, 1::2]  # (N, C, 42, 84)
+    ink = 255 - (rows[..., ::2] + rows[..., 1::2]) / 4  # (N, C, 42, 42): means of 2 x 2 pixels
     return (ink * frames.flatten(2).any(2)[..., None, None]).round().byte()
 
 
@@ -395,8 +384,7 @@ class Agent(nn.Module):
         # Utility function. Gain 0.01 in all three layers (published code) starts from the uniform
         # policy, but also with gradients of about 1e-6, as small as Adam's epsilon.
         project, hidden, out = (0.01,) * 3 if args.small_gains else (1.0, math.sqrt(2), 0.01)
-        needs_projection = args.method == "utility" and not args.bilinear or args.aux_conditioned
-        if needs_projection:
+        if args.method == "utility" and not args.bilinear or args.aux_conditioned:
             self.action_project = layer_init(nn.Linear(D, H), project)
         if args.method == "nearest-neighbor":  # a logit per training action
             self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01)
@@ -547,9 +535,14 @@ def finished(infos: dict, done: np.ndarray, env: str) -> list[tuple]:
     """(score, return, length) of each episode that ended in this step."""
     if not done.any():
         return []
-    score = infos["final_info"][hvae.load_environment(env).METRIC]
-    columns = score, infos["episode"]["r"], infos["episode"]["l"]
-    return list(zip(*(column[done] for column in columns), strict=True))
+    score, episode = infos["final_info"][hvae.load_environment(env).METRIC], infos["episode"]
+    return list(zip(score[done], episode["r"][done], episode["l"][done], strict=True))
+
+
+def mean_episode(episodes: list[tuple], prefix: str = "") -> dict[str, float]:
+    """Means of score, return and length over episodes; nothing if there are none."""
+    names = [f"{prefix}{name}" for name in ("score", "return", "length")]
+    return dict(zip(names, np.mean(episodes, 0).tolist(), strict=True)) if episodes else {}
 
 
 @torch.no_grad()
@@ -601,9 +594,8 @@ class RewardScale(RunningMeanStd):
         """Both (T, N) -> rewards (T, N), clipped to +-10 (published code)."""
         self.G, returns = self.G.to(rewards), []
         for reward, done in zip(rewards, dones, strict=True):
-            self.G = self.gamma * self.G + reward
-            returns.append(self.G)
-            self.G = self.G * (1 - done)
+            returns.append(self.gamma * self.G + reward)
+            self.G = returns[-1] * (1 - done)
         self.update(torch.cat(returns))
         return (rewards / (self.var + 1e-8).sqrt()).float().clamp(-10, 10)
 
@@ -631,28 +623,30 @@ def update(agent: Agent, optimizer, batch: dict, ent_coef: float, args: Args) ->
     """PPO's epochs over one rollout; returns the mean of each part of the loss."""
     b = {k: v.flatten(0, 1) for k, v in batch.items()}  # (T, N, ...) -> (T * N, ...)
     # Only training actions were on offer, so only their rows of P are computed: ids -> rows.
-    b["available"] = torch.searchsorted(agent.train_ids, b["available"])  # (T * N, K)
+    row = torch.zeros(len(agent.table), dtype=torch.int64, device=agent.table.device)
+    row[agent.train_ids] = torch.arange(len(agent.train_ids), device=row.device)
+    b["available"] = row[b["available"]]  # (T * N, K)
     # published code: normalised once over the rollout, the same numbers in every epoch
     everyones = torch.cat(everyone(b["advantage"]))
     b["advantage"] = (b["advantage"] - everyones.mean()) / (everyones.std() + 1e-5)
-    size, history = args.minibatch_size // WORLD_SIZE, []
+    size, history, parameters = args.minibatch_size // WORLD_SIZE, [], list(agent.parameters())
     for _ in range(args.update_epochs):
-        for mb_inds in torch.randperm(len(b["value"]), device=b["value"].device).split(size):
+        for mb_inds in torch.randperm(len(b["value"]), device=row.device).split(size):
             mb = {k: v.index_select(0, mb_inds) for k, v in b.items()}
             P = agent.project_actions(agent.train_ids)  # (n, H): the weights have changed
             loss, parts = ppo_loss(agent, mb, P, ent_coef, args)
             optimizer.zero_grad()
             loss.backward()
-            average_gradients(agent)
-            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            average_gradients(parameters)
+            nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
             optimizer.step()
             history.append(torch.stack([part.detach() for part in parts.values()]))
     means = torch.stack(everyone(torch.stack(history).mean(0))).mean(0)
     return dict(zip(parts, means.tolist(), strict=True))
 
 
-# ---- torchrun: every process (rank) plays num_envs / WORLD_SIZE environments, and learns from its
-# part of each minibatch. Rank 0 alone evaluates, writes and speaks.
+# ---- torchrun: every process (rank) plays its share of the environments and learns from its share of
+# each minibatch. Rank 0 alone evaluates, writes and speaks. ----
 
 
 def everyone(x) -> list:
@@ -661,23 +655,23 @@ def everyone(x) -> list:
         return [x]
     parts = [None] * WORLD_SIZE
     dist.all_gather_object(parts, x)
-    return [p.to(x.device) if isinstance(p, torch.Tensor) else p for p in parts]
+    return [p.to(x.device) if isinstance(x, torch.Tensor) else p for p in parts]
 
 
-def average_gradients(agent: Agent) -> None:
-    """Parts are of equal size, so the mean of their gradients is that of the whole minibatch."""
-    grads = [p.grad for p in agent.parameters() if p.grad is not None]
-    if WORLD_SIZE > 1:  # one message for all of them
-        flat = torch.cat([g.flatten() for g in grads])
+def average_gradients(parameters: list) -> None:
+    """Shares are of equal size, so the mean of their gradients is that of the whole minibatch."""
+    if WORLD_SIZE > 1:
+        grads = [p.grad for p in parameters if p.grad is not None]
+        flat = torch.cat([g.flatten() for g in grads])  # one message for all of them
         dist.all_reduce(flat)
         means = (flat / WORLD_SIZE).split([g.numel() for g in grads])
         for grad, mean in zip(grads, means, strict=True):
             grad.copy_(mean.view_as(grad))
 
 
-# ---- environments, actions, representations ----
+# ---- what is on offer, and what is known about it ----
 
-OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}  # of the constructors
+OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}  # of the environments
 ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
 
 
@@ -690,53 +684,45 @@ def seeds(n: int, *stream: int) -> list[int]:
 
 
 def task_options(args: Args) -> dict:
-    """The options of this environment's constructor, out of the flags."""
+    """The options of this environment, out of the flags."""
     return {name: getattr(args, name) for name in OPTIONS.get(args.env, ())}
 
 
 def make_envs(args: Args, pool, num_envs: int, num_available: int, *stream: int):
-    """Environments that offer `num_available` actions of `pool` in every episode."""
+    """Environments that offer `num_available` actions of `pool` in every episode; see `seeds`."""
     module = hvae.load_environment(args.env)
     envs = module.make_vec(num_envs, pool, num_available, list(stream), **task_options(args))
     return RecordEpisodeStatistics(envs)
 
 
-def plays_one_set(args: Args) -> bool:
-    """Whether all episodes of the training offer one and the same set."""
-    return args.method == "nearest-neighbor" or args.adapt or not args.subsample
-
-
 def action_pools(args: Args) -> tuple[dict[str, tuple], np.ndarray]:
-    """What is on offer: {phase: (pool, K)} with "learn" for learning itself, and all ids of it.
+    """(Sorted ids, K on offer) to "learn" with, and in evaluations "train", "valid" and "test".
 
-    "train", "valid" and "test" are evaluations. A method that trains on one fixed set is scored on
-    that set as "train" (published code); after adaptation there is nothing else.
+    A method that learns with one fixed set is scored on it as "train" (published code). After
+    adaptation there is nothing else. Also returned: all ids that are on offer in training.
     """
     module = hvae.load_environment(args.env)
-    split = module.split_actions(args.split, args.split_seed)
+    split, rng = module.split_actions(args.split, args.split_seed), np.random.default_rng(42)
     pool, K = split["test" if args.adapt else "train"], args.num_available
-    no_op = [module.NO_OP] if hasattr(module, "NO_OP") else []  # CREATE: always on offer, counts
     eval_K = args.eval_available or K
-    if one_set := plays_one_set(args):
-        if args.fixed_set_size and args.method != "nearest-neighbor":
-            # published code: 2,000 products drawn with seed 42
-            pool = np.sort(np.random.default_rng(42).choice(pool, args.fixed_set_size, False))
+    no_op = [module.NO_OP] if hasattr(module, "NO_OP") else []  # CREATE: always on offer, counts
+    if args.one_set:
+        if args.fixed_set_size and args.method != "nearest-neighbor":  # seed 42: published code
+            pool = np.sort(rng.choice(pool, args.fixed_set_size, replace=False))
         K = len(pool) + len(no_op)
-    phases = {"learn": (pool, K), "train": (pool, K if one_set else eval_K)}
-    if not args.adapt:
-        phases |= {phase: (split[phase], eval_K) for phase in ("valid", "test")}
-    for ids, k in phases.values():
-        if not 1 <= k <= len(ids) + len(no_op):
-            flags = "--num-available and, for evaluations, --eval-available"
-            raise ValueError(f"{k} on offer out of {len(ids) + len(no_op)} actions: see {flags}")
+    phases = {"learn": (pool, K), "train": (pool, K if args.one_set else eval_K)}
+    phases |= {} if args.adapt else {p: (split[p], eval_K) for p in ("valid", "test")}
+    for phase, (ids, k) in phases.items():
+        if k > len(ids) + len(no_op):  # num_available; in evaluations eval_available, if given
+            raise ValueError(f"{k} on offer out of {len(ids) + len(no_op)} actions ({phase})")
     return phases, np.union1d(no_op, pool).astype(np.int64)
 
 
 def load_table(args: Args) -> np.ndarray:
     """The representations (A, D); trains the encoder first if its table is not there yet.
 
-    Raises ValueError or FileNotFoundError for a file that is missing, damaged, or was made for
-    another environment, split or action set.
+    Raises ValueError or OSError for a file that is missing, damaged, or was made for another
+    environment, split or action set.
     """
     if args.finetune:
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
@@ -748,42 +734,37 @@ def load_table(args: Args) -> np.ndarray:
             return hvae.load_environment(args.env).engineered_representations(**options)
         except TypeError:
             raise ValueError(f"{args.env} has no representation {args.representation!r}") from None
-    path, wanted = Path(args.representation), None
+    path, wanted = Path(args.representation), {}
     if args.representation in ENCODERS:
-        wanted = hvae.default_args(args.env, args.hvae_recipe, args.modality)
-        same = {k: getattr(args, k) for k in ("split", "split_seed", "device", "runs_dir")}
         # One table serves all policy seeds, as published: the encoder's seed stays 0.
-        wanted = replace(wanted, **same, **ENCODERS[args.representation])
-        path = hvae.representation_path(wanted)
+        same = {k: getattr(args, k) for k in ("split", "split_seed", "device", "runs_dir")}
+        encoder = hvae.default_args(args.env, args.hvae_recipe, args.modality)
+        encoder = replace(encoder, **same, **ENCODERS[args.representation])
+        path, wanted = hvae.representation_path(encoder), asdict(encoder)
         if not path.exists():
             print(f"no representations at {path} yet: training the encoder first", flush=True)
-            hvae.train(wanted)
-    elif path.suffix != ".npz":
-        kinds = ", ".join(ENCODERS)
-        raise ValueError(f"representation {str(path)!r} is none of {kinds}, engineered, FILE.npz")
+            hvae.train(encoder)
     loaded = hvae.load_representation(path, args.env, args.split, args.split_seed)
-    for name, value in asdict(wanted).items() if wanted else ():  # a recipe may have changed
-        there = loaded["config"].get(name, value)
-        if there != value and name not in ("device", "runs_dir"):
-            why = f"made with {name} {there}, the recipe now has {value}"
-            raise ValueError(f"{path} was {why}: delete it, and it is made again")
+    for name in set(wanted) & set(loaded["config"]):  # a recipe may have changed since
+        if (there := loaded["config"][name]) != wanted[name]:
+            why = f"{name} was {there!r} then, it is {wanted[name]!r} now"
+            raise ValueError(f"{path} is of another recipe ({why}): delete it to have it made anew")
     return loaded["mean"]
 
 
 def check(args: Args) -> None:
     """Refuse what cannot be trained, in one line, before anything is made."""
-    for f in fields(args):
-        value = getattr(args, f.name)
-        if type(value) is int and value < (0 if "seed" in f.name else 1):
-            raise ValueError(f"{f.name} {value} is too small")
+    for name, value in asdict(args).items():
+        if type(value) is int and value < (0 if "seed" in name else 1):
+            raise ValueError(f"{name} {value} is too small")
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
-        rule = f"minibatch_size x num_minibatches of num_envs, both of {WORLD_SIZE} processes"
-        raise ValueError(f"these must be multiples: {rule}")
+        rule = f"minibatch_size x num_minibatches of num_envs, and both of {WORLD_SIZE} processes"
+        raise ValueError(f"these have to be multiples: {rule}")
     if not 2 <= size <= args.total_timesteps:
-        raise ValueError(f"total_timesteps {args.total_timesteps}, but one rollout takes {size}")
+        raise ValueError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
     if args.adapt and args.method == "continuous":
-        raise ValueError("adapt: C.2 has method utility and nearest-neighbor only")
+        raise ValueError("adapt: C.2 has the methods utility and nearest-neighbor alone")
     if args.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device cuda: there is none")
     if args.finetune:
@@ -798,29 +779,28 @@ def check(args: Args) -> None:
 def check_effects(args: Args, envs) -> None:
     """Refuse options that would change nothing: a run named after one would be a false result."""
     state, heads = envs.single_observation_space["state"], envs.single_action_space
-    one_set, utility_mlp = plays_one_set(args), args.method == "utility" and not args.bilinear
     has_place = isinstance(heads, gym.spaces.Dict) and "position" in heads.spaces
-    is_image, encoder = len(state.shape) == 3, args.representation in ENCODERS
-    effects = {  # flag: (does it have an effect?, what it takes)
-        "modality": (encoder, "a representation that is learned"),
-        "hvae_recipe": (encoder, "a representation that is learned"),
+    is_image, learned = len(state.shape) == 3, args.representation in ENCODERS
+    sampled = args.method != "nearest-neighbor" and not args.adapt  # unless --no-subsample
+    mlp = args.method == "utility" and not args.bilinear
+    fallback = args.eval_available is None and not args.adapt
+    effects = {  # flag: (has it an effect?, what it takes)
+        "modality": (learned, "a representation that is learned"),
+        "hvae_recipe": (learned, "a representation that is learned"),
         "task": (args.env == "create", "create"),
         "subgoal_reward": (args.env == "create", "create"),
         "placement": (args.env == "stacking", "stacking"),
-        "fully_observable": (args.env == "recsys" and not encoder, "engineered recsys"),
-        "ent_floor": (args.ent_coef > 0, "an ent_coef"),
-        "num_available": (
-            not one_set or (args.eval_available is None and not args.adapt),
-            "a random set in every episode",
-        ),
+        "fully_observable": (args.env == "recsys" and not learned, "recsys, engineered"),
+        "ent_floor": (args.ent_coef > 0, "an entropy bonus"),
+        "num_available": (not args.one_set or fallback, "a set drawn in every episode"),
         "eval_available": (not args.adapt, "other actions to be tested with"),
-        "subsample": (args.method != "nearest-neighbor" and not args.adapt, "random sets"),
-        "fixed_set_size": (one_set and args.method != "nearest-neighbor", "--no-subsample"),
-        "gae_lambda": (args.gamma > 0, "a gamma"),
+        "subsample": (sampled, "a method that draws sets"),
+        "fixed_set_size": (args.one_set and args.method != "nearest-neighbor", "--no-subsample"),
+        "gae_lambda": (args.gamma > 0, "a discount factor"),
         "aux_conditioned": (has_place, "a position to choose"),
-        "one_hot": (not is_image and state.dtype.kind in "iu", "states of integers"),
+        "one_hot": (not is_image and state.dtype.kind in "iu", "states that are integers"),
         "bilinear": (args.method == "utility", "method utility"),
-        "small_gains": (utility_mlp or args.aux_conditioned, "the utility of D.3.2"),
+        "small_gains": (mlp or args.aux_conditioned, "the utility of D.3.2, or C.4"),
         "ink": (is_image, "pictures"),
     }
     default = default_args(args.env, args.recipe, args.quick)
@@ -843,8 +823,8 @@ def train(args: Args) -> dict:
     cuda = args.device != "cpu" and torch.cuda.is_available()
     local = int(os.environ.get("LOCAL_RANK", 0))  # torchrun: a GPU for each process
     device = torch.device("cuda", local) if cuda else torch.device("cpu")
-    phases, train_ids = action_pools(args)
     N, batch_size = args.num_envs // WORLD_SIZE, args.minibatch_size * args.num_minibatches
+    phases, train_ids = action_pools(args)
     pool, K = phases.pop("learn")
     envs = make_envs(args, pool, N, K, args.seed, 1)
     check_effects(args, envs)
@@ -852,23 +832,22 @@ def train(args: Args) -> dict:
 
     torch.manual_seed(seeds(1, args.seed, 2, RANK)[0])
     agent = Agent(envs, table, train_ids, args).to(device)
-    if args.finetune:  # published code: a discrete policy's outputs are actions, so they start anew
+    if args.finetune:  # published code: outputs of the discrete policy are actions, so they are new
         theirs, own = load(Path(args.finetune) / "best.pt")["agent"], agent.state_dict()
-        anew = ["train_ids", *["head.", "fc_stop."] * (args.method == "nearest-neighbor")]
-        agent.load_state_dict({k: (own if k.startswith((*anew,)) else theirs)[k] for k in own})
+        new = ("train_ids", *["head.", "fc_stop."] * (args.method == "nearest-neighbor"))
+        agent.load_state_dict({k: (own if k.startswith(new) else theirs)[k] for k in own})
     agent.load_state_dict(everyone(agent.state_dict())[0])  # the same weights everywhere
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=ADAM_EPS, fused=True)
-    scale = RewardScale(N, args.gamma)
-    noise = torch.cuda if cuda else torch  # whose random numbers are drawn
+    scale, generator = RewardScale(N, args.gamma), torch.cuda if cuda else torch
     update_index, seconds, best_score = 0, 0.0, -math.inf
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         scale.load_state_dict(checkpoint["scale"])
-        if len(checkpoint["noise"]) != WORLD_SIZE or checkpoint["cuda"] != cuda:
+        update_index, seconds, best_score = checkpoint["progress"]
+        if len(checkpoint["generators"]) != WORLD_SIZE or checkpoint["cuda"] != cuda:
             raise ValueError(f"cannot resume {folder}: other processes or another kind of device")
-        noise.set_rng_state(checkpoint["noise"][RANK])
-        update_index, seconds, best_score = (checkpoint[k] for k in PROGRESS)
+        generator.set_rng_state(checkpoint["generators"][RANK])
 
     num_updates = args.total_timesteps // batch_size
     eval_every = max(1, args.eval_every // batch_size)  # in updates
@@ -876,12 +855,12 @@ def train(args: Args) -> dict:
     writer = None if RANK else SummaryWriter(folder, purge_step=update_index * batch_size)
     record = open_metrics(folder / "metrics.csv", update_index * batch_size, writer)
     bar = tqdm(total=num_updates, initial=update_index, disable=True if RANK else None)
-    # Episodes start afresh at every checkpoint, so that a resumed run repeats an unbroken one.
     obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
     while update_index < num_updates:
         began = time.perf_counter()
         left = 1 - min(1.0, update_index / decay_updates)  # D.2 "linear decay"
-        optimizer.param_groups[0]["lr"] = args.learning_rate * (LR_FLOOR + (1 - LR_FLOOR) * left)
+        lr = args.learning_rate * (LR_FLOOR + (1 - LR_FLOOR) * left)
+        optimizer.param_groups[0]["lr"] = lr
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * left)
 
         # Collect: every episode draws its own subset of the training actions.
@@ -889,67 +868,62 @@ def train(args: Args) -> dict:
         rewards = batch["reward"] if agent.is_image else scale(batch["reward"], batch["done"])
         with torch.no_grad():
             next_value = agent.encode(agent.see(obs)[0])[1]  # (N,)
-        now = rewards, batch["value"], batch["done"], next_value
-        batch["advantage"] = gae(*now, args.gamma, args.gae_lambda)
+        known = rewards, batch["value"], batch["done"], next_value
+        batch["advantage"] = gae(*known, args.gamma, args.gae_lambda)
         batch["return"] = batch["advantage"] + batch["value"]
 
         # Learn. Then the normaliser catches up: the policy that collects is the one that learns.
         row = update(agent, optimizer, batch, ent_coef, args)
-        if agent.normalizes and not args.finetune:
+        if agent.normalizes and not args.finetune:  # published code: then it stands still
             agent.obs_stats.update(batch["state"].flatten(0, 1))
         if not all(p.isfinite().all() for p in agent.parameters()):
-            raise ValueError(f"learning_rate {args.learning_rate} is too high: the policy is NaN")
+            raise ValueError(f"learning_rate {args.learning_rate} is too high: weights are NaN")
         update_index += 1
         bar.update()
-        row |= dict(step=update_index * batch_size, learning_rate=optimizer.param_groups[0]["lr"])
+        row |= dict(step=update_index * batch_size, learning_rate=lr)
         row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
         row |= mean_episode(sum(everyone(episodes), []), "episode_")
 
         # Select: the best on validation actions [adaptation: on what it adapts to].
-        if at_checkpoint := update_index % eval_every == 0 or update_index == num_updates:
-            for k, phase in enumerate(phases if not RANK else ()):
-                if phase != "test":
-                    stream = args.seed, 3, update_index, k
-                    score = evaluate(agent, *phases[phase], args.valid_episodes, stream)
-                    row[f"{phase}_score"] = selected_by = score["score"]
-            if not RANK and selected_by > best_score:
-                best_score = selected_by
-                save(folder / "best.pt", args, agent, step=row["step"])
-        seconds += time.perf_counter() - began
-        record(row | dict(seconds=seconds, sps=batch_size / (time.perf_counter() - began)))
-        if at_checkpoint:
-            state = dict(zip(PROGRESS, (update_index, seconds, best_score), strict=True))
-            state |= dict(optimizer=optimizer.state_dict(), scale=scale.state_dict(), cuda=cuda)
-            state["noise"] = torch.stack(everyone(noise.get_rng_state()))
-            save(folder / "checkpoint.pt", args, agent, **state)
+        is_checkpoint = update_index % eval_every == 0 or update_index == num_updates
+        if is_checkpoint and not RANK:
+            for k, phase in enumerate([phase for phase in phases if phase != "test"]):
+                played = phases[phase], args.valid_episodes, (args.seed, 3, update_index, k)
+                row[f"{phase}_score"] = score = evaluate(agent, *played)["score"]
+            if score > best_score:
+                best_score = score
+                save(folder / "best.pt", agent, step=row["step"])
+        row["sps"] = batch_size / (time.perf_counter() - began)
+        row["seconds"] = seconds = seconds + time.perf_counter() - began
+        record(row)
+        if is_checkpoint:
+            state = dict(optimizer=optimizer.state_dict(), scale=scale.state_dict(), cuda=cuda)
+            state["progress"] = update_index, seconds, best_score
+            state["generators"] = torch.stack(everyone(generator.get_rng_state()))
+            save(folder / "checkpoint.pt", agent, **state)
+            # Episodes start afresh, killed or not: so a resumed run repeats an unbroken one.
             obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
             scale.G.zero_()
     bar.close()
     envs.close()
-    if RANK:
-        return {}
-    writer.close()
-    return finish(args, folder, agent, phases, num_updates * batch_size, seconds)
-
-
-PROGRESS = "update_index", "seconds", "best_score"  # of checkpoint.pt
+    return {} if RANK else finish(folder, agent, phases, num_updates * batch_size, seconds)
 
 
 # ---- Algorithm 2: acting with new actions ----
 
 
 @torch.no_grad()
-def evaluate(agent: Agent, pool, num_available, episodes: int, stream, greedy=False) -> dict:
-    """Score of the frozen policy over so many episodes, with actions of `pool` (sorted ids).
+def evaluate(agent: Agent, offer: tuple, episodes: int, stream: tuple, greedy=False) -> dict:
+    """Score of the frozen policy with K actions of a pool on offer; `offer` is (sorted ids, K).
 
-    Actions are sampled, as published; `greedy` is an extra. Returns dict(score, stderr, episodes,
-    return, length). `stream` says which random numbers, see `seeds`.
+    Actions are sampled, as published; `greedy` is an extra. `stream`: see `seeds`.
+    Returns dict(score, return, length, stderr, episodes).
     """
     # published code: 40 x 125 episodes, the first 5,000 to finish; we: as many in every
-    # environment, because the first to finish are the short ones
+    # environment, because those that finish first are the short ones
     N = min(episodes, 40)
-    quota = np.full(N, episodes // N) + (np.arange(N) < episodes % N)
-    envs = make_envs(agent.args, pool, N, num_available, *stream)
+    quota = episodes // N + (np.arange(N) < episodes % N)
+    envs = make_envs(agent.args, offer[0], N, offer[1], *stream)
     (obs, _), P = envs.reset(), agent.project_actions()
     played, results = np.zeros(N, int), []
     while (played < quota).any():
@@ -959,20 +933,13 @@ def evaluate(agent: Agent, pool, num_available, episodes: int, stream, greedy=Fa
         results += finished(infos, done & (played < quota), agent.args.env)
         played += done
     envs.close()
-    score = np.array(results)[:, 0]
-    stderr = score.std() / math.sqrt(episodes)
-    return mean_episode(results) | dict(stderr=float(stderr), episodes=episodes)
+    stderr = float(np.std(results, 0)[0] / math.sqrt(episodes))
+    return mean_episode(results) | dict(stderr=stderr, episodes=episodes)
 
 
-def mean_episode(episodes: list[tuple], prefix: str = "") -> dict[str, float]:
-    """Means of (score, return, length) over episodes; nothing if there are none."""
-    names = [f"{prefix}{name}" for name in ("score", "return", "length")]
-    return dict(zip(names, np.mean(episodes, 0).tolist(), strict=True)) if episodes else {}
+# ---- what a run leaves behind: its name ----
 
-
-# ---- what a run leaves behind ----
-
-# The methods of results/published_results.csv: what sets each of them apart from ours.
+# The methods of results/published_results.csv, and what sets each of them apart from ours.
 METHODS = {
     "discrete_finetuned": dict(method="nearest-neighbor", adapt=True, finetune=True),
     "discrete_from_scratch": dict(method="nearest-neighbor", adapt=True),
@@ -993,75 +960,71 @@ METHODS = {
     "ours_no_place": dict(placement="none"),
     "ours_2d_place": dict(placement="2d"),
 }
-# Where and how a run is carried out makes no other result; the rest has a place of its own.
-UNNAMED = "runs_dir run_name resume device env task fully_observable recipe quick seed bilinear"
+FREE = {"runs_dir", "run_name", "resume", "device"}  # they make no other result
+PLACED = {"env", "task", "fully_observable", "recipe", "quick", "seed", "bilinear"}  # in the name
 
 
 def describe(args: Args) -> tuple[str, dict]:
     """The method's name, and every other option that is not as the recipe has it."""
-    default = asdict(default_args(args.env, args.recipe, args.quick))
-    differs = {k: v for k, v in asdict(args).items() if v != default[k]}
-    differs = {k: v for k, v in differs.items() if k not in UNNAMED.split()}
-    differs |= dict(finetune=True) if args.finetune else {}  # a second one of its name is refused
+    default, here = asdict(default_args(args.env, args.recipe, args.quick)), asdict(args)
+    differs = {k: here[k] for k in here.keys() - FREE - PLACED if here[k] != default[k]}
+    differs |= dict(finetune=True) if args.finetune else {}  # from which run: not in the name
     found = [m for m, changes in METHODS.items() if changes.items() <= differs.items()]
-    name, changes = (found[0], METHODS[found[0]]) if found else ("ours", {})
-    name += "_bilinear" * (args.bilinear and args.method == "utility")  # not the paper's utility
-    return name, {k: v for k, v in differs.items() if k not in changes}
+    name = found[0] if found else "ours"
+    others = {k: differs[k] for k in sorted(differs.keys() - METHODS.get(name, {}).keys())}
+    return name + "_bilinear" * (args.bilinear and args.method == "utility"), others
 
 
 def experiment_name(args: Args) -> str:
-    """<env>[-task][-full], the first part of a run's name; -full: the fully observable C.5."""
+    """<env>[-task][-full]; -full: the fully observable Recommender (C.5)."""
     return "-".join(filter(None, (args.env, args.task, "full" * args.fully_observable)))
 
 
 def run_path(args: Args) -> Path:
-    """<runs_dir>/<env>[-task]-<method>[-quick][-paper][-<option>-<value> ...]-s<seed>."""
+    """<runs_dir>/<env>[-task][-full]-<method>[-quick][-paper][-<option>-<value>]*-s<seed>."""
     method, others = describe(args)
-    parts = [experiment_name(args), method, *["quick"] * args.quick]
-    parts += ["paper"] * (args.recipe == "paper")
-    parts += [f"{k}-{str(v).replace('/', '_').removesuffix('.npz')}" for k, v in others.items()]
+    parts = [experiment_name(args), method]
+    parts += ["quick"] * args.quick + ["paper"] * (args.recipe == "paper")
+    parts += [f"{k}-{v}".replace("/", "_") for k, v in others.items()]
     return Path(args.runs_dir) / (args.run_name or "-".join([*parts, f"s{args.seed}"]))
 
 
 def published_scores(args: Args) -> dict[str, float]:
     """Published mean per phase of this method, {} where there is none."""
     method, others = describe(args)
-    if set(others) & {k for changes in METHODS.values() for k in changes}:
-        return {}  # two changes at once: nobody has published that
-    env = args.env + "_full" * args.fully_observable
     path = Path(__file__).parent / "results" / "published_results.csv"
-    lines = path.read_text().splitlines() if path.exists() else []
-    rows = [r for r in csv.DictReader(lines) if (r["env"], r["method"]) == (env, method)]
-    return {r["phase"]: float(r["mean"]) for r in rows if r["task"] in ("", args.task)}
+    twice = others.keys() & {k for changes in METHODS.values() for k in changes}
+    if twice or not path.exists():  # two changes at once: nobody has published that
+        return {}
+    key = args.env + "_full" * args.fully_observable, method
+    rows = csv.DictReader(path.read_text().splitlines())
+    rows = [r for r in rows if (r["env"], r["method"]) == key and r["task"] in ("", args.task)]
+    return {r["phase"]: float(r["mean"]) for r in rows}
+
+
+# ---- what a run leaves behind: its files ----
 
 
 def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
-    """Claim the run's folder; returns it, the table of representations, what to go on from.
+    """Claim the run's folder: returns it, the representations, and the checkpoint to go on from.
 
-    Making the folder is the claim. If the encoder or its table then fails, the folder is given
-    back; after that (or after a plug was pulled), --resume goes on, at worst from the beginning.
+    Making the folder is the claim. If the representations then fail, it is given back. A run that
+    was killed later goes on with --resume: from its checkpoint, or else from the beginning.
     """
     folder = run_path(args)
-    saved, is_new = folder / "args.json", False
-    if args.resume and saved.exists():
-        there, here = Args(**json.loads(saved.read_text())), replace(args)
-        for name in "resume device runs_dir run_name".split():
-            setattr(here, name, getattr(there, name))
-        for name, value in asdict(there).items():
-            if value != getattr(here, name):
-                why = f"{name} is {value!r} there, {getattr(here, name)!r} here"
-                raise ValueError(f"cannot resume {folder}: {why}")
-    else:
+    saved, is_new = folder / "args.json", not (args.resume and (folder / "args.json").exists())
+    if is_new:
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            raise ValueError(f"{folder} is there already; --resume goes on with a run") from None
-        is_new = True
+            raise ValueError(f"{folder} exists; --resume goes on with a run") from None
         hvae.write(saved, lambda file: file.write(json.dumps(asdict(args), indent=1).encode()))
+    for name, there in json.loads(saved.read_text()).items():
+        if name not in FREE and there != (here := getattr(args, name, None)):
+            raise ValueError(f"cannot resume {folder}: {name} is {there!r} there, {here!r} here")
     try:
-        table = load_table(args)
         path = folder / "checkpoint.pt"
-        return folder, table, load(path) if path.exists() else None
+        return folder, load_table(args), load(path) if path.exists() else None
     except BaseException:
         if is_new:
             saved.unlink()
@@ -1069,15 +1032,15 @@ def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
         raise
 
 
-def save(path: Path, args: Args, agent: Agent, **more) -> None:
-    """Tensors and plain types alone: weights, table and options, no pickled objects (rank 0)."""
-    state = dict(args=asdict(args), agent=agent.state_dict()) | more
+def save(path: Path, agent: Agent, **more) -> None:
+    """Weights, representations, options: tensors and plain types, no pickled objects (rank 0)."""
+    state = dict(args=asdict(agent.args), agent=agent.state_dict()) | more
     if not RANK:
         hvae.write(path, lambda file: torch.save(state, file))
 
 
 def load(path: Path) -> dict:
-    """A checkpoint, with Args as "args"; no code in it is run. ValueError if it is damaged."""
+    """A checkpoint, with Args as "args". Runs no code in it; ValueError if it is damaged."""
     if not path.exists():
         raise FileNotFoundError(f"no checkpoint at {path}")
     try:
@@ -1094,15 +1057,14 @@ COLUMNS = (
 
 
 def open_metrics(path: Path, last_step: int, writer):
-    """A function that writes a row to metrics.csv, TensorBoard and the screen (rank 0).
+    """A function that puts a row into metrics.csv and TensorBoard, scores on the screen (rank 0).
 
-    On resume, rows after the checkpoint's step are cut off: they are about to be made again.
+    Rows after `last_step`, the checkpoint's, are cut off: a resumed run makes them again.
     """
     if RANK:
         return lambda row: None
-    lines = path.read_text().splitlines()[1:] if last_step and path.exists() else []
-    whole = [line for line in lines if line.count(",") == len(COLUMNS) - 1]
-    kept = [line for line in whole if int(line.split(",")[0]) <= last_step]
+    old = path.read_text().splitlines()[1:] if last_step and path.exists() else []
+    kept = [line for line in old if int(line.split(",")[0]) <= last_step]
     text = "\n".join([",".join(COLUMNS), *kept, ""])
     hvae.write(path, lambda file: file.write(text.encode()))
     table = csv.DictWriter(path.open("a", buffering=1), COLUMNS, lineterminator="\n")
@@ -1111,31 +1073,32 @@ def open_metrics(path: Path, last_step: int, writer):
         table.writerow({k: v if k == "step" else f"{v:.6g}" for k, v in row.items()})
         for name, value in row.items():
             writer.add_scalar(name, value, row["step"])
-        if "train_score" in row:
-            scores = (f"{k.split('_')[0]} {row[k]:.3f}" for k in COLUMNS[3:5] if k in row)
+        if scores := [f"{k[:5]} {row[k]:.3f}" for k in COLUMNS[3:5] if k in row]:
             tqdm.write(f"step {row['step']:,}: {', '.join(scores)}")
 
     return record
 
 
-def finish(args: Args, folder: Path, agent: Agent, phases: dict, steps: int, seconds: float):
+def finish(folder: Path, agent: Agent, phases: dict, steps: int, seconds: float) -> dict:
     """Test the best checkpoint, once; write results.json; then draw and print."""
-    best = load(folder / "best.pt")
+    args, best = agent.args, load(folder / "best.pt")
     agent.load_state_dict(best["agent"])
     results = {
-        phase: evaluate(agent, *phases[phase], args.eval_episodes, (args.seed, 4, k))
-        for k, phase in enumerate(phases)
+        phase: evaluate(agent, offer, args.eval_episodes, (args.seed, 4, k))
+        for k, (phase, offer) in enumerate(phases.items())
     }
     seen, unseen = CEILINGS.get(experiment_name(args), (None, None))
     K = PRESETS.get(args.env, args).num_available  # the ceilings are those of Table 3's K
-    ceiling = {phase: seen if phase == "train" else unseen for phase in phases}
     launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
     words = [Path(sys.argv[0]).name, *(word for word in sys.argv[1:] if word != "--resume")]
     results |= dict(
         metric=hvae.load_environment(args.env).METRIC,
         method=describe(args)[0],
         published=published_scores(args),
-        ceiling={phase: c if phases[phase][1] == K else None for phase, c in ceiling.items()},
+        ceiling={
+            phase: None if offer[1] != K else seen if phase == "train" else unseen
+            for phase, offer in phases.items()
+        },
         steps=steps,
         best_step=best["step"],
         hours=seconds / 3600,
@@ -1146,57 +1109,54 @@ def finish(args: Args, folder: Path, agent: Agent, phases: dict, steps: int, sec
     hvae.write(folder / "results.json", lambda file: file.write(text.encode()))
     try:
         plot_curve(folder, results)
-        record_episode(agent, *[*phases.values()][-1], folder / "episode.gif", args.seed)
-    except Exception as e:  # whatever it is, nothing is lost
-        print(f"note: no picture of this run: {type(e).__name__}: {e}")
+        record_episode(agent, [*phases.values()][-1], folder / "episode.gif", args.seed)
+    except Exception as e:  # whatever it is, the results are safe
+        print(f"note: a picture is missing: {type(e).__name__}: {e}")
     print_table(results)
     print(f"curve, episode, metrics and checkpoints: {folder}/")
     return results
 
 
 def print_table(results: dict) -> None:
-    """The last thing on the screen: seen against unseen; ours, published, at best possible."""
-    print(f"\n{results['metric']:12} {'ours':>14} {'published':>10} {'ceiling':>8}", end="")
+    """The last thing on the screen: seen against unseen; ours, published, the best possible."""
+    print(f"\n{results['metric']:10} {'ours':>14} {'published':>10} {'ceiling':>8}", end="")
     print(f"   ({results['method']})")
     names = {"train": "seen", "valid": "validation", "test": "unseen"}
-    for phase in (phase for phase in names if phase in results):
-        ours = results[phase]
+    names = names if "test" in results else {"train": "adapted to"}
+    for phase, name in names.items():
         others = results["published"].get(phase), results["ceiling"][phase]
         published, ceiling = ("-" if x is None else f"{x:.3f}" for x in others)
-        name = names[phase] if "test" in results else "adapted to"
-        print(f"{name:12} {ours['score']:7.3f} ±{ours['stderr']:.3f}", end="")
+        print("{:10} {score:7.3f} ±{stderr:.3f}".format(name, **results[phase]), end="")
         print(f" {published:>10} {ceiling:>8}")
 
 
 def plot_curve(folder: Path, results: dict) -> None:
     """Train and validation score over steps as curve.png, raw: not held at their maximum."""
-    from matplotlib.figure import Figure  # not pyplot: needs no display
+    from matplotlib.figure import Figure  # not pyplot: that would look for a display
 
-    with open(folder / "metrics.csv") as file:
-        rows = [row for row in csv.DictReader(file) if row["train_score"]]
+    rows = csv.DictReader((folder / "metrics.csv").read_text().splitlines())
+    rows = [row for row in rows if row["train_score"]]
     figure = Figure(figsize=(6, 4), layout="tight")
     axes = figure.subplots()
     for name, label in (("train_score", "training actions"), ("valid_score", "validation actions")):
-        points = [(int(r["step"]) / 1e6, float(r[name])) for r in rows if r[name]]
-        if points:
+        if rows[0][name]:  # adaptation has no validation
+            points = [(int(row["step"]) / 1e6, float(row[name])) for row in rows]
             axes.plot(*zip(*points, strict=True), marker=".", label=label)
-    lines = results["ceiling"].get("test"), results["published"].get("test")
-    for y, style, label in zip(lines, ("-", "--"), ("ceiling", "published, test"), strict=True):
-        if y is not None:
-            axes.axhline(y, color="grey", ls=style, lw=1, label=label)
+    for key, style in (("ceiling", "-"), ("published", "--")):
+        if (y := results[key].get("test")) is not None:
+            axes.axhline(y, color="grey", ls=style, lw=1, label=f"{key}, test actions")
     axes.set(xlabel="million steps", ylabel=results["metric"], ylim=(0, None))
     axes.legend(frameon=False)
     hvae.write(folder / "curve.png", lambda file: figure.savefig(file, format="png", dpi=120))
 
 
 @torch.no_grad()
-def record_episode(agent: Agent, pool, num_available: int, path: Path, seed: int) -> None:
+def record_episode(agent: Agent, offer: tuple, path: Path, seed: int) -> None:
     """Play one episode and save it as a GIF, in colour."""
-    args = agent.args
-    module = hvae.load_environment(args.env)
+    args, module = agent.args, hvae.load_environment(agent.args.env)
     name = {"gridworld": "GridWorld", "recsys": "RecSys"}.get(args.env, args.env.capitalize())
     make = getattr(module, f"{name}Env")
-    env = make(pool, num_available, render_mode="rgb_array", **task_options(args))
+    env = make(*offer, render_mode="rgb_array", **task_options(args))
     obs, _ = env.reset(seed=seed)
     P, frames, done = agent.project_actions(), [env.render()], False
     while not done:
@@ -1215,19 +1175,17 @@ def record_episode(agent: Agent, pool, num_available: int, path: Path, seed: int
 
 @dataclass
 class EvaluateArgs:
-    """Score a run's best checkpoint, which is the file best.pt in its folder."""
+    """Score a run's best checkpoint, the file best.pt in its folder, with any actions."""
 
     run: tyro.conf.Positional[str]  # folder of the run
-    actions: Literal["train", "valid", "test"] = "test"  # which actions are on offer
-    num_available: int | None = None  # K (None: that of the run's own test)
+    actions: Literal["train", "valid", "test"] = "test"  # which of them are on offer
+    num_available: int | None = None  # K (None: as in the run's own test)
     episodes: int = 5000  # to play
     seed: int = 0  # of environments and policy
     greedy: bool = False  # take the likeliest choice and the mean position
-    min_angle_gap: float | None = None  # CREATE: so many degrees from every training tool, at least
-    min_embedding_distance: str | None = (
-        None  # squared, to all training actions; or a quantile, q0.5
-    )
-    unseen_ratio: float | None = None  # offer a mixture: this share, the rest training actions
+    min_angle_gap: float | None = None  # CREATE: degrees to the nearest training tool of its class
+    min_embedding_distance: str | None = None  # squared, to training actions; q0.5: a quantile
+    unseen_ratio: float | None = None  # a mixture: this share, and the rest training actions
     save: bool = False  # into evaluations.csv in the run's folder
     gif: str | None = None  # play an episode into this file
 
@@ -1237,8 +1195,12 @@ def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
 
     `table` (A, D) is the agent's, `known` (n,) what it was trained on. ValueError for a bad value.
     """
+    if (options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio) == (None,) * 3:
+        return pool
+    if np.isin(pool, known).any():
+        raise ValueError("the analyses choose among unseen actions; these were trained on")
     if options.min_angle_gap is not None:
-        import create_env  # the only tools with angles
+        import create_env  # no other actions have angles
 
         pool = pool[create_env.angle_gaps(pool, known) >= options.min_angle_gap]
     if (text := options.min_embedding_distance) is not None:
@@ -1272,29 +1234,22 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     best = load(Path(options.run) / "best.pt")
     args, weights, stream = best["args"], best["agent"], (options.seed, 5)
     phases, train_ids = action_pools(args)
-    if args.adapt:  # its training set are the test actions, and all of them are on offer
+    if args.adapt:  # it knows the test actions alone, all of them on offer
         phases["test"] = phases["train"]
     pool, K = phases[options.actions]
-    known = phases["learn"][0]
-    analyses = options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio
-    if analyses != (None,) * 3:
-        if np.isin(pool, known).any():
-            raise ValueError("the analyses choose among unseen actions; these were trained on")
-        pool = restrict_pool(options, weights["table"], pool, known)
-    K = options.num_available or K
-    if options.episodes < 1 or not 1 <= K <= len(pool) + 1:
-        raise ValueError(f"{K} on offer out of {len(pool)} actions, {options.episodes} episodes")
-    envs = make_envs(args, pool, 1, K, *stream)
+    pool = restrict_pool(options, weights["table"], pool, phases["learn"][0])
+    offer = pool, options.num_available or min(K, len(pool))
+    envs = make_envs(args, pool, 1, offer[1], *stream)  # ValueError: more than there are
     agent = Agent(envs, weights["table"].numpy(), train_ids, args)
     envs.close()
     agent.load_state_dict(weights)
     torch.manual_seed(seeds(1, *stream)[0])
-    result = evaluate(agent, pool, K, options.episodes, stream, options.greedy)
-    print(f"{options.actions} actions, K={K}, {result['episodes']} episodes: ", end="")
+    result = evaluate(agent, offer, options.episodes, stream, options.greedy)
+    print(f"{options.actions} actions, K={offer[1]}, {options.episodes} episodes: ", end="")
     print(f"{result['score']:.4f} ± {result['stderr']:.4f} (pool of {len(pool)})")
     if options.save:
         path = Path(options.run) / "evaluations.csv"
-        row = asdict(options) | dict(num_available=K, pool_size=len(pool)) | result
+        row = asdict(options) | dict(num_available=offer[1], pool_size=len(pool)) | result
         columns = EVALUATION + "pool_size score stderr return length".split()
         row = {k: "" if row[k] is None else str(row[k]) for k in columns}
         old = list(csv.DictReader(path.read_text().splitlines())) if path.exists() else []
@@ -1302,7 +1257,7 @@ def evaluate_run(options: EvaluateArgs) -> dict:
         text = "\n".join([",".join(columns), *(",".join(r.values()) for r in rows), ""])
         hvae.write(path, lambda file: file.write(text.encode()))
     if options.gif:
-        record_episode(agent, pool, K, Path(options.gif), options.seed)
+        record_episode(agent, offer, Path(options.gif), options.seed)
     return result
 
 
@@ -1312,7 +1267,7 @@ def evaluate_run(options: EvaluateArgs) -> dict:
 def parse_args(words: list[str]) -> Args:
     """Args of a command line; --help shows the numbers of its environment, recipe and budget."""
     # Three words decide the defaults, so the line is read twice.
-    first = tyro.cli(Args, args=[w for w in words if w not in ("-h", "--help")])
+    first = tyro.cli(Args, args=[word for word in words if word not in ("-h", "--help")])
     default = default_args(first.env, first.recipe, first.quick)
     return tyro.cli(Args, args=words, default=default)
 
@@ -1321,13 +1276,18 @@ def main(words: list[str]) -> None:
     """Train what the command line says, or evaluate what was trained."""
     # ours: layers are so small that a second thread waits more than it works
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 1)))
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        # Freed memory is kept for the next array (M_TRIM_THRESHOLD, M_MMAP_THRESHOLD). Else pages go
+        # back to the system and come again, cleared: CREATE in the paper's recipe takes 2.3 times as
+        # long, Grid World 1.2 times.
+        libc.mallopt(-1, 2**31 - 1)
+        libc.mallopt(-3, 2**31 - 1)
     if words[:1] == ["evaluate"]:
         evaluate_run(tyro.cli(EvaluateArgs, args=words[1:]))
         return
     args = parse_args(words or ["--help"])
-    if WORLD_SIZE > 1:
+    if WORLD_SIZE > 1:  # the others may wait for hours while rank 0 trains an encoder
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-        # The others may wait for hours while rank 0 trains an encoder.
         dist.init_process_group(backend, timeout=timedelta(days=3))
     train(args)
 
