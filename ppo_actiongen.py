@@ -17,13 +17,12 @@ the model on held-out *validation* actions. The test actions are used once, at t
     python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0  # C.2: learn the unseen
     python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --num-available 20 --gif episode.gif
     torchrun --nproc_per_node=2 ppo_actiongen.py create                  # two processes
-    python ppo_actiongen.py create --help             # every hyper-parameter and its default
 
 Paper map (appendix)                                here, in this order
-  Tables 3 and 4                                    Args, PRESETS; ours: FAST, QUICK
+  Tables 3 and 4                                    Args, TABLE_3; ours: FAST, QUICK
   D.3.2 state encoder f_omega, critic V             mlp, cnn, Agent.encode
   D.3.2 utility function f_nu                       utility, Utility, Agent.choice_logits
-  D.3.2 auxiliary policy f_chi (C.4: conditioned)   Agent.position
+  D.3.2 auxiliary policy f_chi (C.4: conditioned)   position_head, Agent.position
   baselines: nearest neighbour, continuous output   Agent.act, Agent.slot
   Algorithm 1: training with random action sets     rollout, gae, ppo_loss, update, train
   Algorithm 2: acting with new actions              evaluate
@@ -43,6 +42,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
@@ -174,30 +174,24 @@ FAST = {
     ),
     "recsys": dict(
         bilinear=True,  # an MLP learns the hidden popularity of single products by heart
-        # What is shown hardly changes what is clicked later. The sum of all later clicks drowns the
-        # one click that a recommendation earned, and the score is a mean over recommendations.
-        gamma=0.0,
+        gamma=0.0,  # hardly any effect on later clicks, whose sum drowns the one that was earned
         minibatch_size=512,
         num_available=100,  # a fifth of the cost of a step
         eval_available=500,
         total_timesteps=10_000_000,
     ),
     "create": dict(
-        # White paper with a few lines: as it comes, what all pictures share drowns what tells them
-        # apart. At half the size an update costs half, and a ball is still 4 pixels across.
-        ink=True,
+        ink=True,  # what all pictures share, white paper, drowns what tells them apart
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         small_gains=False,
         hidden_size=256,  # which tool, and where in this picture: more to know than in a grid
-        minibatch_size=256,
+        minibatch_size=256,  # many small updates ...
         num_minibatches=8,
         learning_rate=5e-4,
         lr_decay_steps=None,
         clip_coef=0.2,  # goals are rare: let each one teach more
-        # A goal is worth 10, so the critic's loss is a thousand times the policy's. They share the
-        # convolutions: at Table 4's 0.5 these would serve the critic alone.
-        vf_coef=0.02,
-        clip_vloss=False,  # in clipped steps of 0.2 the critic never gets to 10
+        vf_coef=0.02,  # a goal is worth 10: at 0.5 the shared convolutions serve the critic alone
+        clip_vloss=False,  # ... and in clipped steps of 0.2 it never gets to 10
         total_timesteps=4_000_000,
         eval_every=205_000,
     ),
@@ -210,19 +204,15 @@ FAST = {
         eval_every=20_500,
     ),
 }
-
 QUICK = {  # --quick, of either recipe
     "gridworld": dict(total_timesteps=1_500_000, hvae_recipe="quick"),
     "recsys": dict(total_timesteps=1_000_000),
     "create": dict(total_timesteps=400_000, hvae_recipe="quick", eval_episodes=500),
     "stacking": dict(total_timesteps=60_000, hvae_recipe="quick", eval_episodes=500),
 }
-
-# What a policy of this kind can reach at best on (seen, unseen) actions, with Table 3's K.
-CEILINGS = {
+CEILINGS = {  # the best such a policy can reach on (seen, unseen) actions, with Table 3's K
     "gridworld": (1.0, 1.0),  # exact search: all but 1 in 7,000 sets of 50 skills hold a solution
-    # Greedy play with the true user vector. The hidden mu_i can be learned by heart for training
-    # products only; fully observable, it is part of the representation.
+    # Greedy play with the true user vector. The hidden mu_i can be learned for seen products only.
     "recsys": (0.664, 0.297),
     "recsys-full": (0.664, 0.664),
 }
@@ -234,8 +224,9 @@ def default_args(env: str, recipe: str = "fast", quick: bool = False) -> Args:
     Raises ValueError for an unknown environment.
     """
     hvae.load_environment(env)
-    changes = FAST.get(env, {}) if recipe == "fast" else {}
-    changes = changes | (QUICK.get(env, {}) if quick else {})
+    changes = (FAST.get(env, {}) if recipe == "fast" else {}) | (
+        QUICK.get(env, {}) if quick else {}
+    )
     args = replace(PRESETS.get(env, Args(env)), recipe=recipe, quick=quick, **changes)
     if quick:  # at least four checkpoints to choose from
         args.eval_every = min(args.eval_every, args.total_timesteps // 4)
@@ -248,8 +239,7 @@ def default_args(env: str, recipe: str = "fast", quick: bool = False) -> Args:
 def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
     """Orthogonal weights, zero bias (published code)."""
     nn.init.orthogonal_(layer.weight, gain)
-    if layer.bias is not None:
-        nn.init.zeros_(layer.bias)
+    nn.init.zeros_(layer.bias)
     return layer
 
 
@@ -268,17 +258,26 @@ def cnn(frames: int, H: int, ink: bool) -> nn.Sequential:
         conv = nn.Conv2d(into, out, 3, stride=2, padding=1)
         # published code: PyTorch's own weights, through which two pictures end up almost the same
         layers += [layer_init(conv) if ink else conv, nn.ReLU()]
-    layers += [nn.Flatten()]  # (B, 32, 3, 3) -> (B, 288)
-    if ink:  # few lines on the picture or many: features of one size
-        layers += [nn.LayerNorm(288, elementwise_affine=False)]
-    return nn.Sequential(*layers, layer_init(nn.Linear(288, H)), nn.ReLU())
+    # ink: features of one size, whether there are few lines on the picture or many
+    norm = nn.LayerNorm(288, elementwise_affine=False) if ink else nn.Identity()
+    project = layer_init(nn.Linear(288, H))  # (B, 32, 3, 3) -> (B, 288) -> (B, H)
+    return nn.Sequential(*layers, nn.Flatten(), norm, project, nn.ReLU())
+
+
+def position_head(H: int, d: int, args: Args) -> nn.Module:
+    """D.3.2: linear, of the code (B, H). C.4: two layers, of [code; action] (B, 2H)."""
+    if not args.aux_conditioned:
+        return layer_init(nn.Linear(H, d), 1.0)
+    # published code: gain 1, so each tool starts at a random place of its own; ours: almost 0, or
+    # only the tool whose first place happens to suit gets practice
+    out = layer_init(nn.Linear(H, d), 1.0 if args.small_gains else 0.01)
+    return nn.Sequential(layer_init(nn.Linear(2 * H, H), 1.0), nn.ReLU(), out)
 
 
 def as_ink(frames: torch.Tensor) -> torch.Tensor:
     """Pictures (N, C, 84, 84) uint8, black on white -> (N, C, 42, 42) uint8, 255 on 0.
 
-    As it comes, white adds the same large number to every feature. Frames from before the episode
-    began are black all over; they turn to zero, too.
+    Frames from before the episode began are black all over; they turn to 0, too.
     """
     rows = frames[:, :, ::2].float() + frames[:, :, 1::2]  # (N, C, 42, 84)
     ink = 255 - (rows[..., ::2] + rows[..., 1::2]) / 4  # (N, C, 42, 42): means of 2 x 2 pixels
@@ -306,8 +305,7 @@ class RunningMeanStd(nn.Module):
 
     def normalize(self, x: torch.Tensor) -> torch.Tensor:
         """(x - mean) / std, clipped to +-10 (eps and clip: published code)."""
-        std = (self.var + 1e-8).sqrt()
-        return ((x - self.mean.float()) / std.float()).clamp(-10, 10)
+        return ((x - self.mean.float()) / (self.var + 1e-8).sqrt().float()).clamp(-10, 10)
 
 
 def utility(u, P, w, available):
@@ -331,8 +329,7 @@ class Utility(torch.autograd.Function):
 
     @staticmethod
     def hidden(u, P, sets):  # (b, H), (A, H), (b, K) -> (b, K, H)
-        x = P.index_select(0, sets.reshape(-1)).view(*sets.shape, -1)
-        return x.add_(u[:, None])
+        return P.index_select(0, sets.reshape(-1)).view(*sets.shape, -1).add_(u[:, None])
 
     @staticmethod
     def forward(ctx, u, P, w, available):
@@ -362,25 +359,27 @@ class Agent(nn.Module):
 
     def __init__(self, envs: gym.vector.VectorEnv, table, train_ids, args: Args):
         super().__init__()
-        space, heads = envs.single_observation_space["state"], envs.single_action_space
-        H, D, self.args = args.hidden_size, table.shape[1], args
+        space, H, D, self.args = (
+            envs.single_observation_space,
+            args.hidden_size,
+            table.shape[1],
+            args,
+        )
         self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
         self.register_buffer("train_ids", torch.tensor(train_ids))  # (n,)
         # State encoder and critic: pictures share the convolutions, vectors share nothing.
-        self.is_image, inputs = len(space.shape) == 3, math.prod(space.shape)
-        self.normalizes = not self.is_image and not args.one_hot
+        shape = space["state"].shape
+        self.is_image, self.normalizes = len(shape) == 3, len(shape) != 3 and not args.one_hot
         if self.is_image:
-            self.encoder = cnn(space.shape[0], H, args.ink)
-            self.critic = layer_init(nn.Linear(H, 1))
+            self.encoder, self.critic = cnn(shape[0], H, args.ink), layer_init(nn.Linear(H, 1))
         else:
+            self.obs_stats, width = RunningMeanStd(shape), math.prod(shape)
             if args.one_hot:  # Grid World shows all of its ids in every first state
-                cells = torch.unique(torch.as_tensor(envs.reset()[0]["state"]))
-                self.register_buffer("cells", cells)
-                inputs *= len(cells)
-            else:  # ids or user vectors as plain numbers
-                self.obs_stats = RunningMeanStd(space.shape)
-            self.encoder = mlp(inputs, H)
-            self.critic = nn.Sequential(mlp(inputs, H), layer_init(nn.Linear(H, 1)))
+                ids = torch.unique(torch.as_tensor(envs.reset()[0]["state"]))
+                self.register_buffer("cell_ids", ids)
+                width *= len(ids)
+            self.encoder = mlp(width, H)
+            self.critic = nn.Sequential(mlp(width, H), layer_init(nn.Linear(H, 1)))
         # Utility function. Gain 0.01 in all three layers (published code) starts from the uniform
         # policy, but also with gradients of about 1e-6, as small as Adam's epsilon.
         project, hidden, out = (0.01,) * 3 if args.small_gains else (1.0, math.sqrt(2), 0.01)
@@ -391,29 +390,20 @@ class Agent(nn.Module):
         elif args.method == "continuous":  # a Gaussian over representations
             self.head_mean, self.head_var = (layer_init(nn.Linear(H, D), 1.0) for _ in "mv")
         elif args.bilinear:
-            self.utility_query = layer_init(nn.Linear(H, D, bias=False), 0.01)
+            self.utility_query = layer_init(nn.Linear(H, D), 0.01)
         else:
             self.utility_hidden = layer_init(nn.Linear(2 * H, H), hidden)
             self.utility_out = layer_init(nn.Linear(H, 1), out)
-        # Auxiliary policy.
-        parts = heads.spaces if isinstance(heads, gym.spaces.Dict) else {}
-        self.has_position, self.has_stop = "position" in parts, "stop" in parts
+        # Auxiliary policy, where there is more to choose than an action.
+        heads = getattr(envs.single_action_space, "spaces", {})
+        self.has_position, self.has_stop = "position" in heads, "stop" in heads
         if self.has_position:
-            d = parts["position"].shape[0]
-            self.fc_alpha, self.fc_beta = (self.position_head(H, d) for _ in "ab")
+            d = heads["position"].shape[0]
+            self.fc_alpha, self.fc_beta = (position_head(H, d, args) for _ in "ab")
         if self.has_stop:
             self.fc_stop = layer_init(nn.Linear(H, 2), 0.01)
             if not args.small_gains:  # ours: else a new policy stops after two shapes
                 nn.init.constant_(self.fc_stop.bias[0], 4.0)
-
-    def position_head(self, H: int, d: int) -> nn.Module:
-        """D.3.2: linear, of the code (B, H). C.4: two layers, of [code; action] (B, 2H)."""
-        if not self.args.aux_conditioned:
-            return layer_init(nn.Linear(H, d), 1.0)
-        # published code: gain 1, a place of its own for every tool, at random; ours: almost 0, or
-        # the tool whose first place happens to suit is the only one that gets practice
-        out = layer_init(nn.Linear(H, d), 1.0 if self.args.small_gains else 0.01)
-        return nn.Sequential(layer_init(nn.Linear(2 * H, H), 1.0), nn.ReLU(), out)
 
     def see(self, obs: dict[str, np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
         """What the environments show as tensors: state (N, ...) and ids on offer (N, K)."""
@@ -427,14 +417,14 @@ class Agent(nn.Module):
             code = self.encoder(state.float() / 255)
             return code, self.critic(code)[:, 0]
         if self.args.one_hot:
-            names = torch.searchsorted(self.cells, state)  # ids -> 0, 1, 2, ...
-            x = F.one_hot(names, len(self.cells)).flatten(1).float()  # (B, cells * ids)
+            names = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
+            x = F.one_hot(names, len(self.cell_ids)).flatten(1).float()  # (B, cells * ids)
         else:
             x = self.obs_stats.normalize(state)
         return self.encoder(x), self.critic(x)[:, 0]
 
-    def project_actions(self, ids: torch.Tensor | None = None) -> torch.Tensor | None:
-        """P, the action's part of `utility`, of all actions (A, H) or of some `ids` (n,) (n, H).
+    def project_actions(self, ids: torch.Tensor | None = None) -> torch.Tensor:
+        """P, the action's part of `utility`, of all actions (A, H) or of some `ids` (n,), (n, H).
 
         It depends on the weights alone: computed once per rollout, once per minibatch.
         """
@@ -455,17 +445,16 @@ class Agent(nn.Module):
         return score(u, P, self.utility_out.weight[0], available) + self.utility_out.bias
 
     def slot(self, output, available):
-        """The slot of the set on offer that an output of the policy stands for, (B,).
+        """The slot (B,) of the set on offer that an output of the policy stands for.
 
-        Baselines: that of the action nearest to the training action, to the point (B, D), which the
-        policy names. This is part of the environment: no gradient goes through it.
+        Baselines: of the action nearest to what the policy names, a training action or a point
+        (B, D). That is part of the environment: no gradient goes through it.
         """
         if self.args.method == "utility":
             return output
         if self.args.method == "nearest-neighbor":
             output = self.table[self.train_ids[output]]  # (B,) -> (B, D)
-        distance = (self.table[available] - output[:, None]).square().sum(2)  # (B, K, D) -> (B, K)
-        return distance.argmin(1)
+        return (self.table[available] - output[:, None]).square().sum(2).argmin(1)  # of (B, K, D)
 
     def position(self, code, taken) -> Beta:
         """f_chi: where to put the chosen action, a Beta on [0, 1]^d; `taken` (B,) are ids (C.4)."""
@@ -483,9 +472,8 @@ class Agent(nn.Module):
         """
         (code, value), new = self.encode(state), action is None
         action = {} if new else action
-        if self.args.method == "continuous":
-            std = F.softplus(self.head_var(code)).sqrt()  # published code: softplus is the variance
-            policy = Normal(self.head_mean(code), std)
+        if self.args.method == "continuous":  # published code: softplus is the variance
+            policy = Normal(self.head_mean(code), F.softplus(self.head_var(code)).sqrt())
         else:
             policy = Categorical(logits=self.choice_logits(code, available, P))
         if new:
@@ -493,11 +481,10 @@ class Agent(nn.Module):
             action["choice"] = self.slot(action["output"], available)
             action["taken"] = available.gather(1, action["choice"][:, None])[:, 0]
         logprob, entropy = policy.log_prob(action["output"]), policy.entropy()
-        if self.args.method == "continuous":  # clamp: published code
-            logprob = logprob.sum(1).clamp(-1e5, 1e5)
-            # published code: the sum in Grid World, else the mean; we: the mean, because then the
-            # coefficient means the same whatever D is
-            entropy = entropy.mean(1)
+        if self.args.method == "continuous":
+            # published code: entropy is the sum in Grid World, else the mean; we: the mean, so that
+            # the coefficient means the same whatever D is. Its clamp is the published code's.
+            logprob, entropy = logprob.sum(1).clamp(-1e5, 1e5), entropy.mean(1)
         if self.has_position:
             place = self.position(code, action["taken"])
             if new:
@@ -517,16 +504,16 @@ class Agent(nn.Module):
 
 def draw(policy: Distribution, greedy: bool) -> torch.Tensor:
     """A sample; greedy: the likeliest choice, the mean position (published code)."""
-    if not greedy:
-        return policy.sample()
-    return policy.mode if isinstance(policy, Categorical) else policy.mean
+    if greedy:
+        return policy.mode if isinstance(policy, Categorical) else policy.mean
+    return policy.sample()
 
 
 # ---- Algorithm 1: rollout, advantages, update ----
 
 
 def to_env(action: dict[str, torch.Tensor]) -> dict[str, np.ndarray] | np.ndarray:
-    """What the environments execute: slots (N,), or a dictionary where there is more to decide."""
+    """What the environments execute: slots (N,), or a dictionary where there is more to choose."""
     parts = {k: action[k].cpu().numpy() for k in ("choice", "position", "stop") if k in action}
     return parts if len(parts) > 1 else parts["choice"]
 
@@ -537,12 +524,6 @@ def finished(infos: dict, done: np.ndarray, env: str) -> list[tuple]:
         return []
     score, episode = infos["final_info"][hvae.load_environment(env).METRIC], infos["episode"]
     return list(zip(score[done], episode["r"][done], episode["l"][done], strict=True))
-
-
-def mean_episode(episodes: list[tuple], prefix: str = "") -> dict[str, float]:
-    """Means of score, return and length over episodes; nothing if there are none."""
-    names = [f"{prefix}{name}" for name in ("score", "return", "length")]
-    return dict(zip(names, np.mean(episodes, 0).tolist(), strict=True)) if episodes else {}
 
 
 @torch.no_grad()
@@ -560,8 +541,7 @@ def rollout(envs, obs, agent: Agent, num_steps: int):
         obs, reward, terminated, truncated, infos = envs.step(to_env(action))
         # Time limits count as ends: short, and part of these tasks (published code).
         done = terminated | truncated
-        for name, x in (("reward", reward), ("done", done)):
-            step[name] = torch.as_tensor(x, dtype=torch.float32, device=value.device)
+        step["reward"], step["done"] = (torch.as_tensor(x).to(value) for x in (reward, done))
         steps.append(step)
         episodes += finished(infos, done, agent.args.env)
     return {k: torch.stack([s[k] for s in steps]) for k in steps[0]}, obs, episodes
@@ -645,31 +625,27 @@ def update(agent: Agent, optimizer, batch: dict, ent_coef: float, args: Args) ->
     return dict(zip(parts, means.tolist(), strict=True))
 
 
-# ---- torchrun: every process (rank) plays its share of the environments and learns from its share of
-# each minibatch. Rank 0 alone evaluates, writes and speaks. ----
+# torchrun: every process (rank) plays its share of the environments and learns from its share of
+# each minibatch. Rank 0 alone evaluates, writes and speaks.
 
 
 def everyone(x) -> list:
     """Everyone's `x`, in the order of the ranks; all of them wait here."""
-    if WORLD_SIZE == 1:
-        return [x]
-    parts = [None] * WORLD_SIZE
-    dist.all_gather_object(parts, x)
+    parts = [x] * WORLD_SIZE
+    if WORLD_SIZE > 1:
+        dist.all_gather_object(parts, x)
     return [p.to(x.device) if isinstance(x, torch.Tensor) else p for p in parts]
 
 
 def average_gradients(parameters: list) -> None:
     """Shares are of equal size, so the mean of their gradients is that of the whole minibatch."""
-    if WORLD_SIZE > 1:
-        grads = [p.grad for p in parameters if p.grad is not None]
-        flat = torch.cat([g.flatten() for g in grads])  # one message for all of them
-        dist.all_reduce(flat)
-        means = (flat / WORLD_SIZE).split([g.numel() for g in grads])
-        for grad, mean in zip(grads, means, strict=True):
-            grad.copy_(mean.view_as(grad))
+    for p in parameters if WORLD_SIZE > 1 else ():
+        if p.grad is not None:
+            dist.all_reduce(p.grad)
+            p.grad /= WORLD_SIZE
 
 
-# ---- what is on offer, and what is known about it ----
+# ---- what is on offer, what is known about it, and what cannot be trained ----
 
 OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}  # of the environments
 ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
@@ -690,8 +666,8 @@ def task_options(args: Args) -> dict:
 
 def make_envs(args: Args, pool, num_envs: int, num_available: int, *stream: int):
     """Environments that offer `num_available` actions of `pool` in every episode; see `seeds`."""
-    module = hvae.load_environment(args.env)
-    envs = module.make_vec(num_envs, pool, num_available, list(stream), **task_options(args))
+    make_vec = hvae.load_environment(args.env).make_vec
+    envs = make_vec(num_envs, pool, num_available, list(stream), **task_options(args))
     return RecordEpisodeStatistics(envs)
 
 
@@ -753,8 +729,11 @@ def load_table(args: Args) -> np.ndarray:
 
 
 def check(args: Args) -> None:
-    """Refuse what cannot be trained, in one line, before anything is made."""
-    for name, value in asdict(args).items():
+    """Refuse, in one line and before anything is made, what cannot be trained or changes nothing.
+
+    A run named after an option that changes nothing would be a false result.
+    """
+    for name, value in vars(args).items():
         if type(value) is int and value < (0 if "seed" in name else 1):
             raise ValueError(f"{name} {value} is too small")
     size = args.minibatch_size * args.num_minibatches
@@ -767,6 +746,35 @@ def check(args: Args) -> None:
         raise ValueError("adapt: C.2 has the methods utility and nearest-neighbor alone")
     if args.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device cuda: there is none")
+    env, nearest, utility = args.env, args.method == "nearest-neighbor", args.method == "utility"
+    learned = args.representation in ENCODERS
+    fallback = args.eval_available is None and not args.adapt
+    effects = {  # flag: (has it an effect?, what it takes)
+        "modality": (learned, "a representation that is learned"),
+        "hvae_recipe": (learned, "a representation that is learned"),
+        "task": (env == "create", "create"),
+        "subgoal_reward": (env == "create", "create"),
+        "placement": (env == "stacking", "stacking"),
+        "fully_observable": (env == "recsys" and not learned, "recsys, engineered"),
+        "ent_floor": (args.ent_coef > 0, "an entropy bonus"),
+        "num_available": (not args.one_set or fallback, "a set drawn in every episode"),
+        "eval_available": (not args.adapt, "other actions to be tested with"),
+        "subsample": (not nearest and not args.adapt, "a method that draws sets"),
+        "fixed_set_size": (args.one_set and not nearest, "--no-subsample or --adapt"),
+        "gae_lambda": (args.gamma > 0, "a discount factor"),
+        "aux_conditioned": (
+            env == "create" or args.placement in ("1d", "2d"),
+            "a position to choose",
+        ),
+        "one_hot": (env not in ("recsys", "create", "stacking"), "states that are integers"),
+        "bilinear": (utility, "method utility"),
+        "small_gains": (utility and not args.bilinear or args.aux_conditioned, "D.3.2's utility"),
+        "ink": (env not in ("gridworld", "recsys"), "pictures"),
+    }
+    default = default_args(env, args.recipe, args.quick)
+    for flag, (has_effect, needs) in effects.items():
+        if not has_effect and getattr(args, flag) != getattr(default, flag):
+            raise ValueError(f"{flag} has no effect here: it needs {needs}")
     if args.finetune:
         theirs = load(Path(args.finetune) / "best.pt")["args"]
         same = "env method representation modality split split_seed fully_observable placement"
@@ -774,39 +782,6 @@ def check(args: Args) -> None:
             if (there := getattr(theirs, name)) != (here := getattr(args, name)):
                 why = f"{name} is {there!r} there, {here!r} here"
                 raise ValueError(f"cannot fine-tune {args.finetune}: {why}")
-
-
-def check_effects(args: Args, envs) -> None:
-    """Refuse options that would change nothing: a run named after one would be a false result."""
-    state, heads = envs.single_observation_space["state"], envs.single_action_space
-    has_place = isinstance(heads, gym.spaces.Dict) and "position" in heads.spaces
-    is_image, learned = len(state.shape) == 3, args.representation in ENCODERS
-    sampled = args.method != "nearest-neighbor" and not args.adapt  # unless --no-subsample
-    mlp = args.method == "utility" and not args.bilinear
-    fallback = args.eval_available is None and not args.adapt
-    effects = {  # flag: (has it an effect?, what it takes)
-        "modality": (learned, "a representation that is learned"),
-        "hvae_recipe": (learned, "a representation that is learned"),
-        "task": (args.env == "create", "create"),
-        "subgoal_reward": (args.env == "create", "create"),
-        "placement": (args.env == "stacking", "stacking"),
-        "fully_observable": (args.env == "recsys" and not learned, "recsys, engineered"),
-        "ent_floor": (args.ent_coef > 0, "an entropy bonus"),
-        "num_available": (not args.one_set or fallback, "a set drawn in every episode"),
-        "eval_available": (not args.adapt, "other actions to be tested with"),
-        "subsample": (sampled, "a method that draws sets"),
-        "fixed_set_size": (args.one_set and args.method != "nearest-neighbor", "--no-subsample"),
-        "gae_lambda": (args.gamma > 0, "a discount factor"),
-        "aux_conditioned": (has_place, "a position to choose"),
-        "one_hot": (not is_image and state.dtype.kind in "iu", "states that are integers"),
-        "bilinear": (args.method == "utility", "method utility"),
-        "small_gains": (mlp or args.aux_conditioned, "the utility of D.3.2, or C.4"),
-        "ink": (is_image, "pictures"),
-    }
-    default = default_args(args.env, args.recipe, args.quick)
-    for flag, (has_effect, needs) in effects.items():
-        if not has_effect and getattr(args, flag) != getattr(default, flag):
-            raise ValueError(f"{flag} has no effect here: it needs {needs}")
 
 
 # ---- Algorithm 1: the training loop ----
@@ -827,7 +802,6 @@ def train(args: Args) -> dict:
     phases, train_ids = action_pools(args)
     pool, K = phases.pop("learn")
     envs = make_envs(args, pool, N, K, args.seed, 1)
-    check_effects(args, envs)
     folder, table, checkpoint = everyone(None if RANK else open_run(args))[0]
 
     torch.manual_seed(seeds(1, args.seed, 2, RANK)[0])
@@ -839,21 +813,21 @@ def train(args: Args) -> dict:
     agent.load_state_dict(everyone(agent.state_dict())[0])  # the same weights everywhere
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=ADAM_EPS, fused=True)
     scale, generator = RewardScale(N, args.gamma), torch.cuda if cuda else torch
-    update_index, seconds, best_score = 0, 0.0, -math.inf
+    update_index, seconds, best_score, size = 0, 0.0, -math.inf, 0
     if checkpoint:
-        agent.load_state_dict(checkpoint["agent"])
-        optimizer.load_state_dict(checkpoint["optimizer"])
-        scale.load_state_dict(checkpoint["scale"])
-        update_index, seconds, best_score = checkpoint["progress"]
         if len(checkpoint["generators"]) != WORLD_SIZE or checkpoint["cuda"] != cuda:
             raise ValueError(f"cannot resume {folder}: other processes or another kind of device")
+        for name, part in (("agent", agent), ("optimizer", optimizer), ("scale", scale)):
+            part.load_state_dict(checkpoint[name])
         generator.set_rng_state(checkpoint["generators"][RANK])
+        update_index, seconds, best_score, size = checkpoint["progress"]
 
     num_updates = args.total_timesteps // batch_size
     eval_every = max(1, args.eval_every // batch_size)  # in updates
     decay_updates = max(1, (args.lr_decay_steps or args.total_timesteps) // batch_size)
+    metrics = open(os.devnull if RANK else folder / "metrics.csv", "a", buffering=1)
+    metrics.truncate(size)  # what came after the checkpoint is made again
     writer = None if RANK else SummaryWriter(folder, purge_step=update_index * batch_size)
-    record = open_metrics(folder / "metrics.csv", update_index * batch_size, writer)
     bar = tqdm(total=num_updates, initial=update_index, disable=True if RANK else None)
     obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
     while update_index < num_updates:
@@ -882,25 +856,28 @@ def train(args: Args) -> dict:
         bar.update()
         row |= dict(step=update_index * batch_size, learning_rate=lr)
         row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
-        row |= mean_episode(sum(everyone(episodes), []), "episode_")
+        if episodes := sum(everyone(episodes), []):
+            row |= zip(EPISODE, np.mean(episodes, 0), strict=True)
 
         # Select: the best on validation actions [adaptation: on what it adapts to].
         is_checkpoint = update_index % eval_every == 0 or update_index == num_updates
+        state = dict(args=vars(args), agent=agent.state_dict(), step=row["step"])
         if is_checkpoint and not RANK:
             for k, phase in enumerate([phase for phase in phases if phase != "test"]):
                 played = phases[phase], args.valid_episodes, (args.seed, 3, update_index, k)
                 row[f"{phase}_score"] = score = evaluate(agent, *played)["score"]
             if score > best_score:
                 best_score = score
-                save(folder / "best.pt", agent, step=row["step"])
+                hvae.write(folder / "best.pt", partial(torch.save, state))
         row["sps"] = batch_size / (time.perf_counter() - began)
         row["seconds"] = seconds = seconds + time.perf_counter() - began
-        record(row)
+        record(row, metrics, writer)
         if is_checkpoint:
-            state = dict(optimizer=optimizer.state_dict(), scale=scale.state_dict(), cuda=cuda)
-            state["progress"] = update_index, seconds, best_score
+            state |= dict(optimizer=optimizer.state_dict(), scale=scale.state_dict(), cuda=cuda)
+            state["progress"] = update_index, seconds, best_score, metrics.tell()
             state["generators"] = torch.stack(everyone(generator.get_rng_state()))
-            save(folder / "checkpoint.pt", agent, **state)
+            if not RANK:
+                hvae.write(folder / "checkpoint.pt", partial(torch.save, state))
             # Episodes start afresh, killed or not: so a resumed run repeats an unbroken one.
             obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
             scale.G.zero_()
@@ -933,14 +910,14 @@ def evaluate(agent: Agent, offer: tuple, episodes: int, stream: tuple, greedy=Fa
         results += finished(infos, done & (played < quota), agent.args.env)
         played += done
     envs.close()
+    score, total, length = np.mean(results, 0).tolist()
     stderr = float(np.std(results, 0)[0] / math.sqrt(episodes))
-    return mean_episode(results) | dict(stderr=stderr, episodes=episodes)
+    return {"score": score, "return": total, "length": length, "stderr": stderr}
 
 
-# ---- what a run leaves behind: its name ----
+# ---- what a run leaves behind ----
 
-# The methods of results/published_results.csv, and what sets each of them apart from ours.
-METHODS = {
+METHODS = {  # of results/published_results.csv, and what sets each of them apart from ours
     "discrete_finetuned": dict(method="nearest-neighbor", adapt=True, finetune=True),
     "discrete_from_scratch": dict(method="nearest-neighbor", adapt=True),
     "ours_finetuned": dict(adapt=True, finetune=True),
@@ -964,26 +941,22 @@ FREE = {"runs_dir", "run_name", "resume", "device"}  # they make no other result
 PLACED = {"env", "task", "fully_observable", "recipe", "quick", "seed", "bilinear"}  # in the name
 
 
-def describe(args: Args) -> tuple[str, dict]:
-    """The method's name, and every other option that is not as the recipe has it."""
-    default, here = asdict(default_args(args.env, args.recipe, args.quick)), asdict(args)
-    differs = {k: here[k] for k in here.keys() - FREE - PLACED if here[k] != default[k]}
+def describe(args: Args) -> tuple[str, str, dict]:
+    """The experiment <env>[-task][-full], the method, and all else that the recipe has otherwise."""
+    default = vars(default_args(args.env, args.recipe, args.quick))
+    differs = {k: v for k, v in vars(args).items() if v != default[k] and k not in FREE | PLACED}
     differs |= dict(finetune=True) if args.finetune else {}  # from which run: not in the name
     found = [m for m, changes in METHODS.items() if changes.items() <= differs.items()]
-    name = found[0] if found else "ours"
-    others = {k: differs[k] for k in sorted(differs.keys() - METHODS.get(name, {}).keys())}
-    return name + "_bilinear" * (args.bilinear and args.method == "utility"), others
-
-
-def experiment_name(args: Args) -> str:
-    """<env>[-task][-full]; -full: the fully observable Recommender (C.5)."""
-    return "-".join(filter(None, (args.env, args.task, "full" * args.fully_observable)))
+    method = found[0] if found else "ours"
+    others = {k: v for k, v in differs.items() if k not in METHODS.get(method, {})}
+    method += "_bilinear" * (args.bilinear and args.method == "utility")  # not the paper's
+    experiment = "-".join(filter(None, (args.env, args.task, "full" * args.fully_observable)))
+    return experiment, method, others
 
 
 def run_path(args: Args) -> Path:
     """<runs_dir>/<env>[-task][-full]-<method>[-quick][-paper][-<option>-<value>]*-s<seed>."""
-    method, others = describe(args)
-    parts = [experiment_name(args), method]
+    *parts, others = describe(args)
     parts += ["quick"] * args.quick + ["paper"] * (args.recipe == "paper")
     parts += [f"{k}-{v}".replace("/", "_") for k, v in others.items()]
     return Path(args.runs_dir) / (args.run_name or "-".join([*parts, f"s{args.seed}"]))
@@ -991,7 +964,7 @@ def run_path(args: Args) -> Path:
 
 def published_scores(args: Args) -> dict[str, float]:
     """Published mean per phase of this method, {} where there is none."""
-    method, others = describe(args)
+    _, method, others = describe(args)
     path = Path(__file__).parent / "results" / "published_results.csv"
     twice = others.keys() & {k for changes in METHODS.values() for k in changes}
     if twice or not path.exists():  # two changes at once: nobody has published that
@@ -1002,9 +975,6 @@ def published_scores(args: Args) -> dict[str, float]:
     return {r["phase"]: float(r["mean"]) for r in rows}
 
 
-# ---- what a run leaves behind: its files ----
-
-
 def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
     """Claim the run's folder: returns it, the representations, and the checkpoint to go on from.
 
@@ -1012,18 +982,17 @@ def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
     was killed later goes on with --resume: from its checkpoint, or else from the beginning.
     """
     folder = run_path(args)
-    saved, is_new = folder / "args.json", not (args.resume and (folder / "args.json").exists())
-    if is_new:
+    saved, path = folder / "args.json", folder / "checkpoint.pt"
+    if is_new := not (args.resume and saved.exists()):
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
             raise ValueError(f"{folder} exists; --resume goes on with a run") from None
-        hvae.write(saved, lambda file: file.write(json.dumps(asdict(args), indent=1).encode()))
+        saved.write_text(json.dumps(vars(args), indent=1))
     for name, there in json.loads(saved.read_text()).items():
         if name not in FREE and there != (here := getattr(args, name, None)):
             raise ValueError(f"cannot resume {folder}: {name} is {there!r} there, {here!r} here")
     try:
-        path = folder / "checkpoint.pt"
         return folder, load_table(args), load(path) if path.exists() else None
     except BaseException:
         if is_new:
@@ -1032,102 +1001,76 @@ def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
         raise
 
 
-def save(path: Path, agent: Agent, **more) -> None:
-    """Weights, representations, options: tensors and plain types, no pickled objects (rank 0)."""
-    state = dict(args=asdict(agent.args), agent=agent.state_dict()) | more
-    if not RANK:
-        hvae.write(path, lambda file: torch.save(state, file))
-
-
 def load(path: Path) -> dict:
     """A checkpoint, with Args as "args". Runs no code in it; ValueError if it is damaged."""
-    if not path.exists():
-        raise FileNotFoundError(f"no checkpoint at {path}")
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         return checkpoint | dict(args=Args(**checkpoint["args"]))
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no checkpoint at {path}") from None
     except Exception as e:  # torch has a dozen kinds of errors for a file that is not its own
         raise ValueError(f"{path} is no checkpoint of this script: {type(e).__name__}") from None
 
 
+EPISODE = "episode_score", "episode_return", "episode_length"
 COLUMNS = (
-    "step seconds sps train_score valid_score episode_score episode_return episode_length "
-    "pg_loss v_loss entropy clip_fraction approx_kl explained_variance learning_rate"
-).split()
+    *("step", "seconds", "sps", "train_score", "valid_score", *EPISODE, "pg_loss", "v_loss"),
+    *("entropy", "clip_fraction", "approx_kl", "explained_variance", "learning_rate"),
+)
 
 
-def open_metrics(path: Path, last_step: int, writer):
-    """A function that puts a row into metrics.csv and TensorBoard, scores on the screen (rank 0).
-
-    Rows after `last_step`, the checkpoint's, are cut off: a resumed run makes them again.
-    """
-    if RANK:
-        return lambda row: None
-    old = path.read_text().splitlines()[1:] if last_step and path.exists() else []
-    kept = [line for line in old if int(line.split(",")[0]) <= last_step]
-    text = "\n".join([",".join(COLUMNS), *kept, ""])
-    hvae.write(path, lambda file: file.write(text.encode()))
-    table = csv.DictWriter(path.open("a", buffering=1), COLUMNS, lineterminator="\n")
-
-    def record(row: dict) -> None:
-        table.writerow({k: v if k == "step" else f"{v:.6g}" for k, v in row.items()})
-        for name, value in row.items():
-            writer.add_scalar(name, value, row["step"])
-        if scores := [f"{k[:5]} {row[k]:.3f}" for k in COLUMNS[3:5] if k in row]:
-            tqdm.write(f"step {row['step']:,}: {', '.join(scores)}")
-
-    return record
+def record(row: dict, metrics, writer) -> None:
+    """A row into metrics.csv and TensorBoard, scores onto the screen (rank 0)."""
+    table = csv.DictWriter(metrics, COLUMNS, lineterminator="\n")
+    if metrics.tell() == 0:
+        table.writeheader()
+    table.writerow({k: v if k == "step" else f"{v:.6g}" for k, v in row.items()})
+    for name, value in row.items() if writer else ():
+        writer.add_scalar(name, value, row["step"])
+    if scores := [f"{k[:5]} {row[k]:.3f}" for k in ("train_score", "valid_score") if k in row]:
+        tqdm.write(f"step {row['step']:,}: {', '.join(scores)}")
 
 
 def finish(folder: Path, agent: Agent, phases: dict, steps: int, seconds: float) -> dict:
     """Test the best checkpoint, once; write results.json; then draw and print."""
     args, best = agent.args, load(folder / "best.pt")
     agent.load_state_dict(best["agent"])
-    results = {
-        phase: evaluate(agent, offer, args.eval_episodes, (args.seed, 4, k))
-        for k, (phase, offer) in enumerate(phases.items())
-    }
-    seen, unseen = CEILINGS.get(experiment_name(args), (None, None))
-    K = PRESETS.get(args.env, args).num_available  # the ceilings are those of Table 3's K
+    experiment, method, _ = describe(args)
     launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
     words = [Path(sys.argv[0]).name, *(word for word in sys.argv[1:] if word != "--resume")]
-    results |= dict(
+    results = dict(
         metric=hvae.load_environment(args.env).METRIC,
-        method=describe(args)[0],
+        method=method,
         published=published_scores(args),
-        ceiling={
-            phase: None if offer[1] != K else seen if phase == "train" else unseen
-            for phase, offer in phases.items()
-        },
+        ceiling={},
         steps=steps,
         best_step=best["step"],
         hours=seconds / 3600,
         seed=args.seed,
         command=f"{launcher} {shlex.join(words)}",
     )
+    for k, (phase, offer) in enumerate(phases.items()):
+        score = evaluate(agent, offer, args.eval_episodes, (args.seed, 4, k))
+        results[phase] = score | dict(episodes=args.eval_episodes)
+        if experiment in CEILINGS and offer[1] == PRESETS[args.env].num_available:
+            results["ceiling"][phase] = CEILINGS[experiment][phase != "train"]
     text = json.dumps(results, indent=1)
     hvae.write(folder / "results.json", lambda file: file.write(text.encode()))
     try:
         plot_curve(folder, results)
-        record_episode(agent, [*phases.values()][-1], folder / "episode.gif", args.seed)
+        record_episode(agent, offer, folder / "episode.gif", args.seed)
     except Exception as e:  # whatever it is, the results are safe
         print(f"note: a picture is missing: {type(e).__name__}: {e}")
-    print_table(results)
+    # The last thing on the screen: seen against unseen; ours, published, the best possible.
+    print(f"\n{results['metric']:10} {'ours':>14} {'published':>10} {'ceiling':>8}   ({method})")
+    names = {"train": "adapted to" if args.adapt else "seen", "valid": "validation"}
+    for phase in phases:
+        others = (results[key].get(phase) for key in ("published", "ceiling"))
+        published, ceiling = ("-" if x is None else f"{x:.3f}" for x in others)
+        ours = "{score:7.3f} ±{stderr:.3f}".format(**results[phase])
+        print(f"{names.get(phase, 'unseen'):10} {ours} {published:>10} {ceiling:>8}")
     print(f"curve, episode, metrics and checkpoints: {folder}/")
     return results
-
-
-def print_table(results: dict) -> None:
-    """The last thing on the screen: seen against unseen; ours, published, the best possible."""
-    print(f"\n{results['metric']:10} {'ours':>14} {'published':>10} {'ceiling':>8}", end="")
-    print(f"   ({results['method']})")
-    names = {"train": "seen", "valid": "validation", "test": "unseen"}
-    names = names if "test" in results else {"train": "adapted to"}
-    for phase, name in names.items():
-        others = results["published"].get(phase), results["ceiling"][phase]
-        published, ceiling = ("-" if x is None else f"{x:.3f}" for x in others)
-        print("{:10} {score:7.3f} ±{stderr:.3f}".format(name, **results[phase]), end="")
-        print(f" {published:>10} {ceiling:>8}")
 
 
 def plot_curve(folder: Path, results: dict) -> None:
@@ -1138,13 +1081,13 @@ def plot_curve(folder: Path, results: dict) -> None:
     rows = [row for row in rows if row["train_score"]]
     figure = Figure(figsize=(6, 4), layout="tight")
     axes = figure.subplots()
-    for name, label in (("train_score", "training actions"), ("valid_score", "validation actions")):
-        if rows[0][name]:  # adaptation has no validation
-            points = [(int(row["step"]) / 1e6, float(row[name])) for row in rows]
-            axes.plot(*zip(*points, strict=True), marker=".", label=label)
-    for key, style in (("ceiling", "-"), ("published", "--")):
-        if (y := results[key].get("test")) is not None:
-            axes.axhline(y, color="grey", ls=style, lw=1, label=f"{key}, test actions")
+    for name in ("train", "valid") if rows[0]["valid_score"] else ("train",):
+        points = [(int(row["step"]) / 1e6, float(row[f"{name}_score"])) for row in rows]
+        axes.plot(*zip(*points, strict=True), marker=".", label=f"{name} actions")
+    for name, style in (("ceiling", "-"), ("published", "--")):
+        if "test" in results[name]:
+            y = results[name]["test"]
+            axes.axhline(y, color="grey", ls=style, lw=1, label=f"{name}, test actions")
     axes.set(xlabel="million steps", ylabel=results["metric"], ylim=(0, None))
     axes.legend(frameon=False)
     hvae.write(folder / "curve.png", lambda file: figure.savefig(file, format="png", dpi=120))
@@ -1155,8 +1098,7 @@ def record_episode(agent: Agent, offer: tuple, path: Path, seed: int) -> None:
     """Play one episode and save it as a GIF, in colour."""
     args, module = agent.args, hvae.load_environment(agent.args.env)
     name = {"gridworld": "GridWorld", "recsys": "RecSys"}.get(args.env, args.env.capitalize())
-    make = getattr(module, f"{name}Env")
-    env = make(*offer, render_mode="rgb_array", **task_options(args))
+    env = getattr(module, f"{name}Env")(*offer, render_mode="rgb_array", **task_options(args))
     obs, _ = env.reset(seed=seed)
     P, frames, done = agent.project_actions(), [env.render()], False
     while not done:
@@ -1180,12 +1122,12 @@ class EvaluateArgs:
     run: tyro.conf.Positional[str]  # folder of the run
     actions: Literal["train", "valid", "test"] = "test"  # which of them are on offer
     num_available: int | None = None  # K (None: as in the run's own test)
-    episodes: int = 5000  # to play
-    seed: int = 0  # of environments and policy
-    greedy: bool = False  # take the likeliest choice and the mean position
     min_angle_gap: float | None = None  # CREATE: degrees to the nearest training tool of its class
     min_embedding_distance: str | None = None  # squared, to training actions; q0.5: a quantile
     unseen_ratio: float | None = None  # a mixture: this share, and the rest training actions
+    greedy: bool = False  # take the likeliest choice and the mean position
+    episodes: int = 5000  # to play
+    seed: int = 0  # of environments and policy
     save: bool = False  # into evaluations.csv in the run's folder
     gif: str | None = None  # play an episode into this file
 
@@ -1195,38 +1137,30 @@ def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
 
     `table` (A, D) is the agent's, `known` (n,) what it was trained on. ValueError for a bad value.
     """
-    if (options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio) == (None,) * 3:
-        return pool
-    if np.isin(pool, known).any():
+    gap, distance, ratio = (
+        options.min_angle_gap,
+        options.min_embedding_distance,
+        options.unseen_ratio,
+    )
+    if (gap, distance, ratio) != (None, None, None) and np.isin(pool, known).any():
         raise ValueError("the analyses choose among unseen actions; these were trained on")
-    if options.min_angle_gap is not None:
+    if gap is not None:
         import create_env  # no other actions have angles
 
-        pool = pool[create_env.angle_gaps(pool, known) >= options.min_angle_gap]
-    if (text := options.min_embedding_distance) is not None:
+        pool = pool[create_env.angle_gaps(pool, known) >= gap]
+    if distance is not None:
         exact = "donot_use_mm_for_euclid_dist"
         squared = torch.cdist(table[pool], table[known], compute_mode=exact).amin(1).square()
-        try:
-            least = float(text.removeprefix("q"))
-            # published: absolute distances, which depend on the scale of the encoder's table
-            least = float(squared.quantile(least)) if text[0] == "q" else least
-        except (ValueError, IndexError, RuntimeError):
-            raise ValueError(f"min_embedding_distance {text!r}: a number, or q and 0..1") from None
+        # published: absolute distances, which depend on the scale of the encoder's table
+        least = float(distance.removeprefix("q"))
+        least = float(squared.quantile(least)) if distance[0] == "q" else least
         pool = pool[squared.numpy() >= least]
-    if (ratio := options.unseen_ratio) is not None:
-        if not 0 <= ratio <= 1:
-            raise ValueError(f"unseen_ratio {ratio} is not in 0..1")
-        # Two pools of one size, so that the ratio is that of what is offered.
+    if ratio is not None:  # two pools of one size, so that the ratio is that of what is offered
         rng, size = np.random.default_rng(options.seed), min(len(pool), len(known))
         count = round(ratio * size)
         unseen = rng.choice(pool, count, replace=False)
         pool = np.union1d(unseen, rng.choice(known, size - count, replace=False))
     return pool
-
-
-EVALUATION = (
-    "actions num_available min_angle_gap min_embedding_distance unseen_ratio greedy episodes seed"
-).split()
 
 
 def evaluate_run(options: EvaluateArgs) -> dict:
@@ -1249,19 +1183,16 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     print(f"{result['score']:.4f} ± {result['stderr']:.4f} (pool of {len(pool)})")
     if options.save:
         path = Path(options.run) / "evaluations.csv"
-        row = asdict(options) | dict(num_available=offer[1], pool_size=len(pool)) | result
-        columns = EVALUATION + "pool_size score stderr return length".split()
-        row = {k: "" if row[k] is None else str(row[k]) for k in columns}
+        asked = {k: v for k, v in vars(options).items() if k not in ("run", "save", "gif")}
+        row = asked | dict(num_available=offer[1], pool_size=len(pool)) | result
+        row = {k: "" if v is None else str(v) for k, v in row.items()}
         old = list(csv.DictReader(path.read_text().splitlines())) if path.exists() else []
-        rows = [r for r in old if any(r[k] != row[k] for k in EVALUATION)] + [row]
-        text = "\n".join([",".join(columns), *(",".join(r.values()) for r in rows), ""])
+        rows = [r for r in old if any(r[k] != row[k] for k in asked)] + [row]
+        text = "\n".join([",".join(row), *(",".join(r.values()) for r in rows), ""])
         hvae.write(path, lambda file: file.write(text.encode()))
     if options.gif:
         record_episode(agent, offer, Path(options.gif), options.seed)
     return result
-
-
-# ---- command line ----
 
 
 def parse_args(words: list[str]) -> Args:
@@ -1277,11 +1208,10 @@ def main(words: list[str]) -> None:
     # ours: layers are so small that a second thread waits more than it works
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 1)))
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        # Freed memory is kept for the next array (M_TRIM_THRESHOLD, M_MMAP_THRESHOLD). Else pages go
-        # back to the system and come again, cleared: CREATE in the paper's recipe takes 2.3 times as
-        # long, Grid World 1.2 times.
-        libc.mallopt(-1, 2**31 - 1)
-        libc.mallopt(-3, 2**31 - 1)
+        # Freed memory is kept for the next array. Else its pages go back to the system and come
+        # again, cleared: CREATE takes 1.2 times as long, with the paper's minibatches 2.3 times.
+        libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
+        libc.mallopt(-3, 2**31 - 1)  # M_MMAP_THRESHOLD
     if words[:1] == ["evaluate"]:
         evaluate_run(tyro.cli(EvaluateArgs, args=words[1:]))
         return
