@@ -517,7 +517,6 @@ FIRST_CORNER = {"Funnel": 30, "Bucket": 45}  # published code, degrees at tool a
 NO_OP_RADIUS = 0.1 * math.sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
-@functools.cache
 def outline(tool: Tool) -> list[tuple[float, float]]:
     """Corners of an object, or ends of its line, around its place; discs have none.
 

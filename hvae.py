@@ -12,13 +12,13 @@ observations share (the action) lands in c; what differs (start cell, camera ang
 The representation of an action is the mean of q(c | X). It is computed for every action, but the
 networks are trained on training actions only: unseen actions are encoded without re-training.
 
-    python hvae.py gridworld                     # the default table of the Grid World experiments
+    python hvae.py gridworld                     # the default table of Grid World
     python hvae.py gridworld --modality onehot   # B: one-hot states, cross-entropy
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
-    python hvae.py gridworld --train-on all      # the oracle encoder: it has seen every action
+    python hvae.py gridworld --train-on all      # the oracle encoder sees every action
     python hvae.py create --split full           # B; also --modality video; or: stacking
     python hvae.py gridworld --recipe paper      # Tables 3-4 to the letter: days on a CPU
-    python hvae.py create --recipe quick --help  # the numbers of this environment and recipe
+    python hvae.py create --recipe quick --help  # the numbers of this recipe
 """
 
 import colorsys
@@ -54,9 +54,8 @@ os.environ.setdefault("MKL_CBWR", "AUTO")
 ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
-# Of relative trajectories: centre and half-width of the first states, which bring them to about
-# [-1, 1], and the unit of differences. The decoder's smallest sigma is exp(-4 / 2) = 0.135 units:
-# what tells two actions apart must be several sigma.
+# Of relative trajectories: centre and half-width of first states, and the unit of differences. The
+# decoder's smallest sigma is exp(-4 / 2) = 0.135 units: less than what tells two actions apart.
 UNITS = {
     "gridworld": (39.5, 39.5, 1.0),  # A.1: cells 1..78; one move is 7 sigma
     "create": (0.0, 1.0, 4 / 42),  # ours: 4 of 84 pixels, so that sigma can fall to half a pixel
@@ -109,8 +108,7 @@ TABLE_4 = dict(learning_rate=1e-3, observations=1024, q_hidden=128, hidden=64)
 # appendix: an update sees all 1,024 observations of an action; published code: 45 to 672 of them;
 # we do as the appendix. In Grid World that takes 11 GB of memory.
 PAPER = dict(updates=0, batch_observations=1024, set_size=1024, relative=False, kl_warmup=0.0)
-# appendix: width 64, and one column for CREATE; published code: this for videos and pictures; we do
-# as the code.
+# appendix: width 64, one column for CREATE; published code: this for pictures; we do as the code.
 PAPER_VISUAL = dict(batch_size=32, epochs=5_000, hidden=128)
 
 # How the short recipes leave the paper. (Three constants do so further down: search for "paper".)
@@ -131,17 +129,22 @@ LAPTOP = dict(
 BALLS = dict(set_size=1024, kl_warmup=0.5, learning_rate=3e-3, batch_observations=8)
 PICTURES = BALLS | dict(learning_rate=2e-3, batch_observations=4, batch_size=16)
 LAPTOP_OF = {  # an environment or a modality
+    "gridworld": dict(updates=1_000),  # with the linear path: see ActionInference
     "onehot": dict(updates=4_000),  # 160 zeros and ones say the same as 2 numbers, learned later
     "create": BALLS | dict(updates=2_500),
     "image": PICTURES | dict(updates=1_500),
     "video": PICTURES | dict(updates=600, observations=128),  # 1,024 of every tool are 28 GB
 }
-# quick: half of the updates, and as many observations as a minute of recording allows.
-QUICK_OF = {"create": 128, "image": 64, "video": 16}
+QUICK_OF = {  # as many observations as a minute of recording allows
+    "onehot": dict(updates=2_000),
+    "create": dict(updates=1_250, observations=128),
+    "image": dict(updates=750, observations=64),
+    "video": dict(updates=200, observations=16),
+}
 
 
 def load_environment(name: str):
-    """The module of an environment by its command-line name; ValueError if there is none."""
+    """The module of an environment by its name; ValueError if there is none."""
     if name not in ENVIRONMENTS:
         raise ValueError(f"unknown environment {name!r}; allowed: {', '.join(ENVIRONMENTS)}")
     return importlib.import_module(ENVIRONMENTS[name])
@@ -162,13 +165,12 @@ def default_args(env: str = "gridworld", recipe: str = "laptop", modality: str |
     if recipe != "paper":
         numbers |= LAPTOP | LAPTOP_OF.get(env, {}) | LAPTOP_OF.get(modality, {})
     if recipe == "quick":
-        numbers["updates"] //= 2
-        numbers["observations"] = QUICK_OF.get(modality, QUICK_OF.get(env, 1024))
+        numbers |= QUICK_OF.get(env, {}) | QUICK_OF.get(modality, {})
     return Args(env=env, modality=modality, recipe=recipe, **numbers)
 
 
 def check(args: Args) -> None:
-    """ValueError for numbers that make no sense, and for options that would change nothing."""
+    """ValueError for numbers that make no sense and options that change nothing."""
     default = default_args(args.env, args.recipe, args.modality)
     least = dict(seed=0, split_seed=0, updates=0, kl_warmup=0, learning_rate=1e-9, observations=2)
     for name, value in asdict(args).items():
@@ -240,11 +242,9 @@ class SumReLU(nn.Module):
 
 
 class GlobalBatchNorm(nn.BatchNorm1d):
-    """The "1D batch-norm" of D.3.1: one mean, variance, gain and bias over batch *and* dimensions.
+    """The "1D batch-norm" of D.3.1: one mean, variance, gain, bias over batch *and* dimensions."""
 
-    A batch norm per dimension would blow up those dimensions of a latent that carry nothing.
-    """
-
+    # A batch norm per dimension would blow up those dimensions of a latent that carry nothing.
     def __init__(self):
         super().__init__(1, eps=1e-3, momentum=0.01)  # published code
 
@@ -265,12 +265,10 @@ def initialise(module: nn.Module) -> None:
 
 
 class ConvEncoder(nn.Module):
-    """Pictures (B, 1, S, S) -> (B, 288): 7 layers for S = 48, 9 layers for S = 84.
+    """Pictures (B, 1, S, S) -> (B, 288): 7 layers for S = 48, 9 layers for S = 84."""
 
-    A layer is a 3x3 convolution, batch norm and ReLU; every other one halves the picture.
-    """
-
-    # Sides: 48 -> 24 -> 12 -> 6 -> 3, or 84 -> 42 -> 21 -> 11 -> 6 -> 3.
+    # A layer is a 3x3 convolution, batch norm and ReLU; every other one halves the picture:
+    # 48 -> 24 -> 12 -> 6 -> 3, or 84 -> 42 -> 21 -> 11 -> 6 -> 3.
     CHANNELS = {48: (8, 8, 16, 16, 16, 16, 32), 84: (8, 8, 16, 16, 16, 16, 32, 32, 32)}
 
     def __init__(self, side):
@@ -307,7 +305,7 @@ class TrajectoryEncoder(nn.Module):
 class ActionInference(nn.Module):
     """q(c | X): encoded observations (A, n, H) -> Gaussian of c, (A, C)."""
 
-    def __init__(self, hidden, width, size):
+    def __init__(self, hidden, width, size, numbers=0):
         super().__init__()
         self.before = nn.Sequential(  # 4 linear layers, on each observation
             nn.Linear(hidden, width), nn.ReLU(), Residual(width, 2), nn.Linear(width, width)
@@ -315,10 +313,19 @@ class ActionInference(nn.Module):
         # appendix: 3 layers; published code: 4 (a block of 3 and the output); we do as the code.
         self.after = nn.Sequential(Residual(width, 3), nn.Linear(width, 2 * size))
         self.norm = GlobalBatchNorm()  # published code: over mean and log-variance together
+        self.linear = nn.Linear(numbers, size) if numbers else None
 
     def forward(self, h):
         pooled = self.before(h).mean(1)  # (A, n, width) -> (A, width), whatever the order and n
-        return normal(*self.norm(self.after(pooled)).chunk(2, -1))  # (A, 2C) -> twice (A, C)
+        out = self.after(pooled)  # (A, 2C)
+        # Linear path, ours, in Grid World's short recipes: the mean of c is a linear map of the
+        # averaged observations plus 0.1 of the networks. Networks may put every training skill
+        # anywhere; a linear map that tells their moves apart does so for unseen skills, too.
+        # MEASURED
+        if self.linear:
+            straight = self.linear(h[..., -self.linear.in_features :].mean(1))  # (A, C)
+            out = 0.1 * out + F.pad(straight, (0, straight.shape[1]))
+        return normal(*self.norm(out).chunk(2, -1))  # twice (A, C)
 
 
 class ObservationInference(nn.Module):
@@ -343,10 +350,7 @@ class ObservationInference(nn.Module):
 
 
 class ObservationDecoder(nn.Module):
-    """First state (B, F) and latents -> means, or logits, of the T later states (B, T, F).
-
-    If T is 0 (a picture): the latents alone -> its features (B, 1, F).
-    """
+    """First state (B, F) and latents -> means, or logits, of the T later states (B, T, F)."""
 
     def __init__(self, latents, features, hidden, steps):
         super().__init__()
@@ -357,7 +361,7 @@ class ObservationDecoder(nn.Module):
         self.output = nn.Sequential(Residual(hidden, 2), nn.Linear(hidden, features))
 
     def forward(self, start, *latents):
-        if not self.steps:
+        if not self.steps:  # a picture: its features (B, 1, F)
             return self.output(self.sum(*latents))[:, None]
         # The product lets the start gate the effect: beside a wall, a move does nothing.
         combined = self.sum(*latents) * self.start(start)  # (B, H)
@@ -400,7 +404,9 @@ class ConvDecoder(nn.Module):
 
 
 class ObservationModel(nn.Module):
-    """What HVAE and VAE share: encoder, decoder and likelihood of observations of a raw shape."""
+    """What HVAE and VAE share: encoder, decoder and likelihood of observations."""
+
+    numbers = 0  # in an observation, for the linear path of ActionInference; 0: there is none
 
     def __init__(self, args, shape, latents):
         super().__init__()
@@ -420,16 +426,17 @@ class ObservationModel(nn.Module):
             self.sequence = TrajectoryEncoder(features, hidden, compact=args.recipe != "paper")
         steps = 0 if picture else shape[0] - 1  # T
         self.decoder = ObservationDecoder(latents, features, hidden, steps)
-        if args.modality != "onehot":  # one number per feature or pixel, for all steps and actions
+        if args.modality != "onehot":  # one number per feature or pixel
             self.log_var = nn.Parameter(torch.randn(sigmas))
             if args.recipe != "paper":  # ours: at -2, a move of one cell is already 2.7 sigma
                 nn.init.constant_(self.log_var, -2.0)
 
     def encode(self, x):
-        """Inputs of `prepare` -> states (B, L, F), of pictures features; encoded ones (B, H)."""
+        """Inputs of `prepare` -> states or features (B, L, F), encoded (B, H)."""
         if self.args.modality in VISUAL:
             x = self.conv(x.flatten(0, 1)).unflatten(0, x.shape[:2])  # (B * L, 1, S, S) -> 288 each
-        return x, self.sequence(x)
+        h = self.sequence(x)
+        return x, torch.cat([h, x.flatten(1)], 1) if self.numbers else h
 
     def decode(self, start, frame, *latents):
         """First states, first frames (of videos), latents -> means, or logits (B, T, 2, 80)."""
@@ -444,7 +451,7 @@ class ObservationModel(nn.Module):
         # appendix: mask * picture + frame; published code: mask * picture + (1 - mask) * frame; we
         # do as the code, since the plain sum leaves the range of a pixel.
         video = self.args.modality == "video"
-        return mask * picture + (1 - mask) * frame if video else picture  # (B, T, 1, S, S)
+        return mask * picture + (1 - mask) * frame if video else picture
 
     def forward(self, raw):
         """Raw observations (A, n, ...) -> loss and its parts, each per observation."""
@@ -466,13 +473,15 @@ class ObservationModel(nn.Module):
 
 
 class HVAE(ObservationModel):
-    """The hierarchical model: c for the action, z for the observation, x decoded from both."""
+    """c for the action, z for the observation, x decoded from both."""
 
     def __init__(self, args, shape):
         size, hidden = args.representation_size, args.hidden
         super().__init__(args, shape, latents=(size, size))
-        self.q_c = ActionInference(hidden, args.q_hidden, size)
-        self.q_z = ObservationInference((hidden, size), hidden, size)
+        if args.env == "gridworld" and args.modality == "xy" and args.recipe != "paper":
+            self.numbers = shape[0] * shape[1]
+        self.q_c = ActionInference(hidden + self.numbers, args.q_hidden, size, self.numbers)
+        self.q_z = ObservationInference((hidden + self.numbers, size), hidden, size)
         self.p_z = ObservationInference((size,), hidden, size)
         self.apply(initialise)
 
@@ -484,7 +493,7 @@ class HVAE(ObservationModel):
         return (q_z.rsample(), c), kl_divergence(q_z, self.p_z(c)), kl_divergence(q_c, p_c)
 
     def represent(self, h):
-        """The representation: the mean of q(c | X), from encoded observations (A, n, H): (A, C)."""
+        """The mean of q(c | X), from encoded observations (A, n, H): (A, C)."""
         return self.q_c(h).mean
 
 
@@ -505,7 +514,7 @@ class VAE(ObservationModel):
         return (q_z.rsample(),), kl_divergence(q_z, Normal(0.0, 1.0)), torch.zeros_like(h[:1])
 
     def represent(self, h):
-        """The mean, over the observations of an action, of the means of q(z | x): (A, Z)."""
+        """The mean over observations of the means of q(z | x): (A, Z)."""
         return self.q_z(h.flatten(0, 1)).mean.unflatten(0, h.shape[:2]).mean(1)  # from (A, n, Z)
 
 
@@ -525,7 +534,7 @@ def write(path: Path, save) -> None:
 
 
 def observe(module, ids: np.ndarray, args: Args) -> np.ndarray:
-    """Raw observations (len(ids), n, ...) of the actions `ids`, recorded once for all encoders."""
+    """Raw observations (len(ids), n, ...), recorded once for all encoders."""
 
     def record(some: np.ndarray) -> np.ndarray:
         workers = os.cpu_count() or 1  # always seed 0: encoders differ by seed, not by data
@@ -555,13 +564,10 @@ def observe(module, ids: np.ndarray, args: Args) -> np.ndarray:
     return np.load(path, mmap_mode="r")  # only what is used is in memory (810 shapes: 5.9 GB)
 
 
-def fit(model: ObservationModel, data: np.ndarray, rows: np.ndarray, args: Args) -> list[dict]:
-    """Maximise the objective on the observations data[rows] of the training actions.
-
-    Returns the losses of every update. Raises ValueError if they diverge."""
+def fit(model, data: np.ndarray, rows: np.ndarray, args: Args) -> list[dict]:
+    """Maximise the objective on data[rows]; return the losses of every update."""
     device = next(model.parameters()).device
-    # Ours: a free log-variance moves by about the learning rate per update, so it would take 10,000
-    # updates from its start to the -9 of the released tables.
+    # Ours: a free log-variance moves by its rate per update: 10,000 of them to the published -9.
     rates = args.learning_rate, args.learning_rate * (1 if args.recipe == "paper" else 10)
     parameters = model.named_parameters()
     groups = [dict(params=p, lr=rates[name.endswith("log_var")]) for name, p in parameters]
@@ -593,11 +599,8 @@ def fit(model: ObservationModel, data: np.ndarray, rows: np.ndarray, args: Args)
 
 
 @torch.no_grad()
-def embed(model: ObservationModel, data: np.ndarray, ids: np.ndarray, args: Args) -> np.ndarray:
-    """Tables (3, NUM_ACTIONS, C) of the actions `ids`, from their raw observations `data`.
-
-    The first is from all observations, the others from every second one. Other actions have 0.
-    """
+def embed(model, data: np.ndarray, ids: np.ndarray, args: Args) -> np.ndarray:
+    """Tables (3, NUM_ACTIONS, C): from all observations, and from two halves of them."""
     device = next(model.parameters()).device
     model.eval()  # running statistics: a representation does not depend on its neighbours
     num_actions = load_environment(args.env).NUM_ACTIONS
@@ -611,10 +614,8 @@ def embed(model: ObservationModel, data: np.ndarray, ids: np.ndarray, args: Args
 
 
 def train(args: Args) -> Path:
-    """Train an encoder, write its table to `representation_path(args)` and return that path.
-
-    Beside the .npz: .pt (weights), .csv (losses), .json (`probe` scores) and -tsne.png.
-    """
+    """Train an encoder, write its table; return its path, `representation_path(args)`."""
+    # Beside the .npz: .pt (weights), .csv (losses), .json (`probe` scores) and -tsne.png.
     check(args)
     module, path = load_environment(args.env), representation_path(args)
     split = module.split_actions(args.split, args.split_seed)
@@ -623,7 +624,7 @@ def train(args: Args) -> Path:
     devices = ["cpu"] + ["cuda"] * torch.cuda.is_available()
     device = devices[-1] if args.device == "auto" else args.device
     if device not in devices:
-        raise ValueError(f"device {device!r} is not available; allowed: auto, {', '.join(devices)}")
+        raise ValueError(f"device {device!r} is not available; allowed: auto, {devices}")
     path.parent.mkdir(parents=True, exist_ok=True)  # now: fails before the training, not after
     data = observe(module, pool, args)
     threads = torch.get_num_threads()
@@ -636,8 +637,8 @@ def train(args: Args) -> Path:
         tables = embed(model, data, pool, args)
     torch.set_num_threads(threads)
     write(path.with_suffix(".pt"), lambda file: torch.save(model.cpu().state_dict(), file))
-    rows, names = [list(row.values()) for row in losses], ",".join(losses[0])
-    form = dict(fmt="%.6g", delimiter=",", header=names, comments="")
+    rows = [list(row.values()) for row in losses]
+    form = dict(fmt="%.6g", delimiter=",", header=",".join(losses[0]), comments="")
     write(path.with_suffix(".csv"), lambda file: np.savetxt(file, rows, **form))
     config = {k: v for k, v in asdict(args).items() if k not in ("device", "runs_dir")}
     save_representation(path, tables[0], ids, config)
@@ -650,8 +651,7 @@ def train(args: Args) -> Path:
 
 def representation_path(args: Args) -> Path:
     """Where `train(args)` writes its table."""
-    # A hash of what differs from the recipe is in the name: a policy that asks for a recipe's table
-    # never finds an experiment's.
+    # With a hash of what differs: who asks for a recipe's table never finds an experiment's.
     model = ("hvae" if args.hierarchical else "vae") + "-all" * (args.train_on == "all")
     name = f"{args.env}-{args.modality}-{model}-{args.split}{args.split_seed}-{args.recipe}"
     default = asdict(default_args(args.env, args.recipe, args.modality))
@@ -673,10 +673,9 @@ def fingerprint(module) -> str:
 def save_representation(path, mean: np.ndarray, action_ids: np.ndarray, config: dict) -> Path:
     """Write a table that `load_representation` accepts, whoever made it; return its path.
 
-    Row i of mean (NUM_ACTIONS, D) is what the policy is told about action i. action_ids: those that
-    the encoder was trained on, or []. config: whatever JSON can hold; "env" is a key of
-    ENVIRONMENTS; "split" and "split_seed", where given, are checked at loading.
-    Raises ValueError for an unknown environment, wrong shapes, or numbers that are not finite.
+    mean: (NUM_ACTIONS, D). action_ids: what the encoder was trained on, or []. config: whatever
+    JSON can hold; "env" must be in it, "split" and "split_seed" are checked at loading.
+    Raises ValueError for an unknown environment, wrong shapes, infinite numbers.
     """
     path, module, ids = Path(path), load_environment(config.get("env")), np.asarray(action_ids)
     with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused
@@ -691,7 +690,7 @@ def save_representation(path, mean: np.ndarray, action_ids: np.ndarray, config: 
 
 
 def load_representation(path, env: str, split: str = "default", split_seed: int = 0) -> dict:
-    """Read a table and make sure that it belongs to this environment, action set and split.
+    """Read a table; make sure that it belongs to this environment, action set and split.
 
     Returns mean (NUM_ACTIONS, D) float32, action_ids int64, and config, a dict.
     Raises FileNotFoundError without a file, ValueError if it is damaged or belongs elsewhere.
@@ -731,10 +730,7 @@ PUBLISHED = {  # scores of the released 10,000-epoch tables: net_r2, move_accura
 
 
 def probe(mean, train_ids, held_out_ids, env="gridworld", halves=None) -> dict[str, float]:
-    """What a table tells: read-outs fitted on train actions, scored on held-out ones.
-
-    halves: two tables from disjoint observations, for `draw_noise`.
-    """
+    """What a table tells: read-outs fitted on train actions, scored on others."""
     from scipy.spatial.distance import cdist
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.metrics import r2_score
@@ -774,7 +770,8 @@ def probe(mean, train_ids, held_out_ids, env="gridworld", halves=None) -> dict[s
     # Linear read-out of the engineered features.
     scores["engineered_r2"] = linear(np.asarray(module.engineered_representations()))
     if halves is not None:
-        # Distance between the two halves, over that to the nearest train action (both RMS).
+        # Distance between tables from two halves of the observations, over that to the nearest
+        # train action (both RMS): what a table owes to the draw of its observations.
         noise = ((halves[0] - halves[1])[held_out_ids] ** 2).sum(1).mean()
         scores["draw_noise"] = np.sqrt(noise / (near.min(1) ** 2).mean())
     return {key: round(float(value), 4) for key, value in scores.items()}
@@ -788,7 +785,6 @@ def report(path: Path, tables: np.ndarray, args: Args) -> None:
     held_out = np.concatenate([split["valid"], split["test"]])
     held_out = np.setdiff1d(held_out, train_ids)  # CREATE's no-op is on both sides
     scores = probe(tables[0], train_ids, held_out, args.env, tables[1:])
-    # Two yardsticks: the scores of the ground truth, and those of the released tables.
     truth = probe(module.engineered_representations(), train_ids, held_out, args.env)
     published = dict(zip(scores, PUBLISHED.get(name, ()), strict=False))
     record = json.dumps(dict(scores=scores, engineered=truth, published=published)) + "\n"
@@ -801,7 +797,7 @@ def report(path: Path, tables: np.ndarray, args: Args) -> None:
 
 
 def plot_tsne(mean: np.ndarray, labels: np.ndarray, path: Path, title: str) -> None:
-    """Figures 4-6: representations (count, D) laid out by t-SNE, one hue and mark per label."""
+    """Figures 4-6: representations (count, D) by t-SNE, one hue and mark per label."""
     from matplotlib.figure import Figure
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
