@@ -260,7 +260,7 @@ def draw_lines(
             x = [tested(phase) / (1e6 if xlabel == "million steps" else 1) for phase in phases]
             y, std = (np.array([f(seeds) for seeds in phases.values()]) for f in (mean, pstdev))
             (key[label],) = axis.plot(x, y, **dict(lw=1.3, ms=3.5) | look)
-            axis.fill_between(x, y - std, y + std, color=look["color"], alpha=0.12, lw=0)
+            axis.fill_between(x, y - std, y + std, color=look["color"], alpha=0.2, lw=0)
         axis.set_title(name, fontsize=8 if width > 2 else 7)
         axis.set_ylim(0, None)
     for axis in axes[-columns:]:
@@ -309,10 +309,10 @@ def draw_embeddings(path: Path, figure: str) -> None:
     for axis, (name, (table, labels)) in zip(axes, panels.items(), strict=True):
         spots = TSNE(perplexity=10, init="pca", random_state=0).fit_transform(table)  # (n, 2)
         for i, label in enumerate(names):
-            look = dict(s=8, marker="osD^"[i % 4], lw=0)
-            color = colormaps["hsv"](0.95 * i / len(names))
-            key[label] = axis.scatter(*spots[labels == label].T, color=color, **look)
-        axis.set(title=name, xticks=[], yticks=[])
+            color = colormaps["tab10" if len(names) <= 10 else "tab20"](i)
+            look = dict(s=8, marker="osD^"[i % 4], lw=0, color=color)
+            key[label] = axis.scatter(*spots[labels == label].T, **look)
+        axis.set(title=name, xticks=[], yticks=[], frame_on=False)
     save(picture, path, key, 7)
 
 
