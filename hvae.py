@@ -45,7 +45,6 @@ os.environ.setdefault("MKL_CBWR", "AUTO")
 
 # Paper map: Tables 3-4 -> Args, TABLE_3, TABLE_4; D.3.1 -> the networks, in its order, from
 # ConvEncoder to ConvDecoder; B -> HVAE, VAE, prepare; Figures 4-6 -> plot_tsne.
-
 # Shapes: A actions in a batch, n observations of each, B = A * n, L states per trajectory (the
 # first is given, T = L - 1 are predicted), F numbers per state, C = Z sizes of c and z, H hidden
 # width, S side of a picture.
@@ -116,8 +115,7 @@ LAPTOP = dict(
     # Raw cells run to 78: the networks would first have to learn to subtract the start to a tenth
     # of a cell before any skill shows. Differences show it from the first update.
     relative=True,
-    # Observations of one action differ little, so many small updates teach more than few large
-    # ones. A single observation would leave nothing to pool over.
+    # Observations of one action differ little: many small updates teach more than few large ones.
     batch_observations=4,
     # Each update sees 4 of a set of 64, and each of the 4 bears 1/64 of KL(q(c|X)). Not quite the
     # ELBO: c comes from the 4 alone. At 1/4, c kept only 4 of its 16 dimensions in use.
@@ -321,7 +319,8 @@ class ActionInference(nn.Module):
         # Linear path, ours, in Grid World's short recipes: the mean of c is a linear map of the
         # averaged observations plus 0.1 of the networks. Networks may put every training skill
         # anywhere; a linear map that tells their moves apart does so for unseen skills, too.
-        # MEASURED
+        # Validation success of one policy after 1.5M steps, seeds and splits 0, 1, 2: with the path
+        # 0.877, 0.851, 0.796; without it 0.847, 0.752, 0.699 (after 2,750 updates, not 1,000).
         if self.linear:
             straight = self.linear(h[..., -self.linear.in_features :].mean(1))  # (A, C)
             out = 0.1 * out + F.pad(straight, (0, straight.shape[1]))
@@ -414,6 +413,7 @@ class ObservationModel(nn.Module):
         if args.modality in VISUAL:  # shape: (S, S), of videos (L, S, S)
             self.conv = ConvEncoder(shape[-1])
             self.conv_decoder = ConvDecoder(shape[-1], mask=not picture)
+            self.to(memory_format=torch.channels_last)  # ours: 1.4 times as fast on a CPU
             features, sigmas = CONV_FEATURES, (1, *shape[-2:])
         else:  # shape: (L, F)
             features = shape[-1] * (CLASSES if args.modality == "onehot" else 1)
@@ -629,7 +629,7 @@ def train(args: Args) -> Path:
     data = observe(module, pool, args)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # networks are small: a second thread waits more than it works
-    # The caller's random numbers stay as they are, whether its table was there or not.
+    # The caller's random numbers stay as they are, whether a table was there or not.
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(args.seed)
         model = (HVAE if args.hierarchical else VAE)(args, data.shape[2:]).to(device)
