@@ -15,11 +15,13 @@ since two recipes never share a table. benchmarks/report.py draws them.
 """
 
 import csv
+import io
 import json
 import os
 import platform
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections import defaultdict
@@ -177,6 +179,13 @@ class Job:
         return f"python {script} {shlex.join(self.words)}"
 
 
+def parse(words: list[str]) -> ppo_actiongen.Args:
+    """The options of a training, as the script reads them: the first three decide the defaults."""
+    first = tyro.cli(ppo_actiongen.Args, args=words)
+    default = ppo_actiongen.default_args(first.env, first.recipe, first.quick)
+    return tyro.cli(ppo_actiongen.Args, args=words, default=default)
+
+
 @cache  # what several rows need is one job
 def expand(figure: str, row: str, seed: int, args: Args) -> Job:
     """The job of one row and seed."""
@@ -202,10 +211,10 @@ def expand(figure: str, row: str, seed: int, args: Args) -> Job:
         path = hvae.representation_path(encoder)
         return Job(figure, row, seed, kind, words, encoder, path, needs)
     if args.budget != 1:
-        usual = ppo_actiongen.parse_args(words).total_timesteps
+        usual = parse(words).total_timesteps
         words += ["--total-timesteps", str(round(args.budget * usual))]
     words += shlex.split(args.extra)
-    training = ppo_actiongen.parse_args(words)
+    training = parse(words)
     path = ppo_actiongen.run_path(training)
     return Job(figure, row, seed, "train", words, training, path, needs)
 
@@ -242,11 +251,12 @@ def read(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.open())) if path.exists() else []
 
 
+@cache
 def machine() -> str:
     """Processor and threads of a job: hours mean little without them."""
-    name = platform.processor() or platform.machine()
-    if Path("/proc/cpuinfo").exists():  # Linux: platform knows no more than "x86_64"
-        name = re.search(r"model name\s*: (.+)|$", Path("/proc/cpuinfo").read_text())[1] or name
+    cpu = Path("/proc/cpuinfo")  # Linux
+    found = re.search(r"model name\s*: (.+)", cpu.read_text()) if cpu.exists() else None
+    name = found[1] if found else platform.processor()
     return f"{name}, {os.environ.get('OMP_NUM_THREADS', 1)} thread(s)"  # 1: as the scripts do
 
 
@@ -307,18 +317,13 @@ def merge(path: Path, columns: list[str], key: list[str], rows: list[dict]) -> N
     for row in rows:
         row = {c: "" if row.get(c) is None else row[c] for c in columns}
         row = {c: f"{v:.6g}" if isinstance(v, float) else str(v) for c, v in row.items()}
-        k = tuple(row[k] for k in key)
-        # The same score again: the row keeps the machine that made it.
-        if k not in table or "score" not in row or row["score"] != table[k]["score"]:
-            table[k] = row
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        order = sorted(table, key=lambda k: [part.zfill(9) * part.isdigit() or part for part in k])
-        writer.writerows(table[k] for k in order)  # numbers by size
-    temporary.replace(path)
+        table[tuple(row[k] for k in key)] = row
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    order = sorted(table, key=lambda k: [part.zfill(9) * part.isdigit() or part for part in k])
+    writer.writerows(table[k] for k in order)  # numbers by size
+    hvae.write(path, lambda file: file.write(text.getvalue().encode()))
 
 
 LOCK = Lock()  # one at a time writes tables
@@ -339,6 +344,8 @@ def run(job: Job, args: Args) -> bool:
     with LOCK:
         name = job.figure + "-paper" * (args.recipe == "paper")
         merge(Path(args.results_dir) / f"{name}.csv", COLUMNS, COLUMNS[:9], found)
+        if (tsne := job.folder.with_name(f"{job.folder.stem}-tsne.png")).exists():
+            shutil.copy(tsne, Path(args.results_dir) / f"{name}-tsne-{job.row}.png")
         if job.kind == "train":
             path = Path(args.results_dir) / f"{name}_curves.csv"
             merge(path, CURVES, CURVES[:7], curve_rows(job))

@@ -56,7 +56,7 @@ ENVIRONMENTS = {  # title, what a score is
     "create": ("CREATE", "success rate"),
     "stacking": ("Shape Stacking", "height"),
 }
-# Mean score of random play: `python benchmarks/throughput.py random_play`. Not listed: 0.
+# Mean score of random play (slow tests of the environments). Not listed: 0.
 CHANCE = {"gridworld": 0.003, "recsys": 0.156, "recsys_full": 0.156, "stacking": 1.6}
 CHANCE |= {"push": 0.016, "seesaw": 0.003, "navigate": 0.002, "buckets": 0.005, "cannon": 0.004}
 CHANCE |= {"collide": 0.008, "moving": 0.023, "ladder": 0.003, "basket": 0.011, "funnel": 0.022}
@@ -174,19 +174,6 @@ def table(figure: str, cells: Cells) -> str:
     return markdown([corner, "method", "steps", "seeds", *heads, "ceiling"], lines)
 
 
-def adaptation_table(curves: Cells, zero: dict[Place, float]) -> str:
-    """Figure 9: steps on the unseen actions that it takes to reach what zero-shot has at once."""
-    methods, lines = [*dict.fromkeys(method for _, method in curves)], []
-    for place in places(curves):
-        lines.append([title(place), f"{zero[place]:.3f}"])
-        for points in (curves.get((place, method), {}) for method in methods):
-            # One point may jump over the line; the mean of a point and the next four does not.
-            y, x = [*map(mean, points.values())], [*map(int, points)]
-            above = [s for i, s in enumerate(x[:-4]) if mean(y[i : i + 5]) > zero[place]]
-            lines[-1].append(f"{above[0]:,}" if above else f"not in {x[-1]:,}" if x else "")
-    return markdown([" ", "zero-shot", *(METHODS[m][0] for m in methods)], lines)
-
-
 def canvas(count: int, columns: int, width: float, height: float, **options):
     """A figure with `count` panels of this size in inches, and its panels."""
     import matplotlib
@@ -214,9 +201,7 @@ def save(figure, path: Path, key: dict, columns: int = 5) -> None:
         picture = Image.open(file).convert("RGB")
     # The usual median cut gives small areas, such as dots, the colour of their neighbours.
     picture = picture.quantize(64, method=Image.Quantize.MAXCOVERAGE, kmeans=4)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    picture.save(temporary, "PNG", optimize=True)
-    temporary.replace(path)
+    hvae.write(path, lambda file: picture.save(file, "PNG", optimize=True))
 
 
 def draw_bars(path: Path, cells: Cells) -> None:
@@ -246,13 +231,10 @@ def draw_bars(path: Path, cells: Cells) -> None:
     save(figure, path, key)
 
 
-Line = tuple[str, dict[str, list[float]], dict]  # label, phase -> its seeds, Axes.plot's options
-
-
 def draw_lines(
-    path: Path, panels: dict[str, list[Line]], xlabel: str, columns=3, width=3.1
+    path: Path, panels: dict[str, list[tuple]], xlabel: str, columns=3, width=3.1
 ) -> None:
-    """Mean and, as a band, standard deviation over the numbers in phases (or steps)."""
+    """Panels of (label, {phase or step: its seeds}, look): mean and standard deviation."""
     figure, axes = canvas(len(panels), columns, width, 0.3 + 0.7 * width)
     key = {}
     for axis, (name, some) in zip(axes, panels.items(), strict=True):
@@ -268,7 +250,7 @@ def draw_lines(
     save(figure, path, key, 3)
 
 
-def lines_of(figure: str, cells: Cells, zero: dict[Place, float]) -> dict[str, list[Line]]:
+def lines_of(figure: str, cells: Cells, zero: dict[Place, float]) -> dict[str, list[tuple]]:
     """A panel per environment for `draw_lines`: ours, published, the zero-shot score."""
     panels = defaultdict(list)
     for (place, method), phases in cells.items():
@@ -282,38 +264,6 @@ def lines_of(figure: str, cells: Cells, zero: dict[Place, float]) -> dict[str, l
             level = {step: [zero[place]] for step in phases}
             panels[name].append(("Ours, zero-shot", level, dict(color="black", ls="--")))
     return panels
-
-
-def draw_embeddings(path: Path, figure: str) -> None:
-    """Figures 4-6: a t-SNE panel per encoder that has been trained, unseen actions by label."""
-    from matplotlib import colormaps
-    from sklearn.manifold import TSNE
-
-    panels = {}  # label -> representations and labels of unseen actions
-    args = paper.Args((figure,), recipe="paper" if path.stem.endswith("-paper") else "fast")
-    for row in TABLE[figure]:
-        job = paper.expand(figure, row, 0, args)
-        module = hvae.load_environment(job.args.env)
-        split = module.split_actions(job.args.split, job.args.split_seed)
-        unseen = np.setdiff1d([*split["valid"], *split["test"]], split["train"])
-        if (ROOT / job.folder).exists():
-            table = np.load(ROOT / job.folder, allow_pickle=False)["mean"]
-            panels[METHODS[row][0]] = table[unseen], module.action_labels()[unseen]
-    if not panels:
-        return  # the picture that was drawn where the encoders are stays
-    if figure == "fig4" and "Ours" in panels:
-        panels["Engineered"] = module.engineered_representations()[unseen], panels["Ours"][1]
-    names = sorted({label for _, labels in panels.values() for label in labels})
-    picture, axes = canvas(len(panels), 4, 2.6, 2.7)
-    key = {}
-    for axis, (name, (table, labels)) in zip(axes, panels.items(), strict=True):
-        spots = TSNE(perplexity=10, init="pca", random_state=0).fit_transform(table)  # (n, 2)
-        for i, label in enumerate(names):
-            color = colormaps["tab10" if len(names) <= 10 else "tab20"](i)
-            look = dict(s=8, marker="osD^"[i % 4], lw=0, color=color)
-            key[label] = axis.scatter(*spots[labels == label].T, **look)
-        axis.set(title=name, xticks=[], yticks=[], frame_on=False)
-    save(picture, path, key, 7)
 
 
 def section(name: str, draw: bool) -> str:
@@ -336,13 +286,13 @@ def section(name: str, draw: bool) -> str:
         zero = {place: mean(cell["zero-shot"]) for (place, _), cell in tests.items()}
         curves = group(read(RESULTS / "fig9_curves.csv"), "step", "episode_score")
         curves = {key: points for key, points in curves.items() if key[0] in zero}
-        text, lines = adaptation_table(curves, zero), lines_of(name, curves, zero)
-        picture = partial(draw_lines, path, lines, "million steps")
+        picture = partial(draw_lines, path, lines_of(name, curves, zero), "million steps")
+        text = "Success with unseen actions over steps of training on them."
     elif name in ANALYSES:
         text, lines = table(name, group(rows)), lines_of(name, group(rows), {})
         picture = partial(draw_lines, path, lines, ANALYSES[name][1])
-    elif figure in ("fig4", "fig5", "fig6"):
-        text, picture = table(name, group(rows)), partial(draw_embeddings, path, figure)
+    elif figure in ("fig4", "fig5", "fig6"):  # t-SNE by hvae.py, one picture per encoder
+        text, picture = table(name, group(rows)), None
     else:
         rows = [row for row in rows if row["phase"] != "valid"]
         cells = group(rows)
@@ -352,8 +302,9 @@ def section(name: str, draw: bool) -> str:
         picture = partial(draw_bars, path, cells) if drawn else None
     if draw and picture:
         picture()
-    image = f"![{name}]({{folder}}{name}.png)" if picture and path.exists() else ""
-    return "\n\n".join(filter(None, [text, *notes, image])) + "\n"
+    pictures = [path, *sorted(RESULTS.glob(f"{name}-tsne-*.png"))]
+    images = [f"![{p.stem}]({{folder}}{p.name})" for p in pictures if p.exists()]
+    return "\n\n".join(filter(None, [text, *notes, *images])) + "\n"
 
 
 def main(check: bool = False) -> None:

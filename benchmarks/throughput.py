@@ -2,7 +2,6 @@
 
     python benchmarks/throughput.py                    # all groups
     python benchmarks/throughput.py utility learner    # only these
-    python benchmarks/throughput.py random_play        # what a random policy scores, all tasks
 
 The two sides of a ratio take turns, so that whatever else the machine does slows both. The rates
 behind it are this machine's at this hour, and of no use elsewhere.
@@ -26,7 +25,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 CLASSES = {"gridworld": "GridWorldEnv", "recsys": "RecSysEnv", "create_env": "CreateEnv"}
 CLASSES |= {"stacking_env": "StackingEnv"}
-TASKS = "push navigate obstacle seesaw belt buckets cannon collide moving ladder basket funnel"
 
 
 def compare(what: str, count: int, works: dict[str, Callable], seconds=6.0) -> None:
@@ -41,9 +39,8 @@ def compare(what: str, count: int, works: dict[str, Callable], seconds=6.0) -> N
             work()
             spent[name] += time.perf_counter() - start
     fast, slow = (calls * count / t for t in spent.values())
-    print(
-        f"{what}: {' : '.join(works)} = {fast / slow:.2f}   ({fast:,.0f} : {slow:,.0f} per second)"
-    )
+    rates = f"({fast:,.0f} : {slow:,.0f} per second)"
+    print(f"{what}: {' : '.join(works)} = {fast / slow:.2f}   {rates}")
 
 
 def make_env(name: str, **options):
@@ -58,15 +55,12 @@ def make_env(name: str, **options):
     return module, env, itertools.cycle(actions)
 
 
-def play(env, actions, steps: int, metric: str = "") -> list[float]:
-    """So many steps of one environment, restarts included; the metric of each episode."""
-    scores = []
+def play(env, actions, steps: int) -> None:
+    """So many steps of one environment, restarts included."""
     for action in itertools.islice(actions, steps):
-        _, _, terminated, truncated, info = env.step(action)
+        _, _, terminated, truncated, _ = env.step(action)
         if terminated or truncated:
-            scores.append(float(info.get(metric, 0)))
             env.reset()
-    return scores
 
 
 def environments() -> None:
@@ -80,21 +74,6 @@ def environments() -> None:
         compare(name, 32, {"vector": vector, "alone": partial(play, env, actions, 32)})
         envs.close()
         env.close()
-
-
-def physics() -> None:
-    """Shape Stacking until all shapes are at rest, against 300 exact steps each: actions."""
-    module, env, actions = make_env("stacking_env")
-
-    def work(early_stop: bool, residual: float) -> None:
-        env.early_stop, module.SOLVER_RESIDUAL = early_stop, residual
-        play(env, actions, 20)
-
-    ours, plain = (
-        partial(work, True, module.SOLVER_RESIDUAL),
-        partial(work, False, 1e-7),
-    )  # Bullet's
-    compare("stacking", 20, {"ours": ours, "plain": plain}, 20.0)
 
 
 def utility() -> None:
@@ -135,19 +114,7 @@ def learner() -> None:
         print(f"{env}: fast : paper = {fast / paper:.2f}   ({fast:,.0f} : {paper:,.0f} steps/s)")
 
 
-def random_play() -> None:
-    """What a random policy scores: CHANCE in report.py."""
-    rows = [("gridworld", {}, 400_000), ("recsys", {}, 100_000), ("stacking_env", {}, 1_000)]
-    for name, options, steps in rows + [("create_env", {"task": t}, 30_000) for t in TASKS.split()]:
-        module, env, actions = make_env(name, **options)
-        scores = play(env, actions, steps, module.METRIC)
-        error = statistics.pstdev(scores) / len(scores) ** 0.5
-        print(" ".join([name, *options.values()]), end=": ")
-        print(f"{statistics.mean(scores):.4f} ± {error:.4f}, {len(scores)} episodes", flush=True)
-        env.close()
-
-
-GROUPS = {f.__name__: f for f in (environments, physics, utility, learner, random_play)}
+GROUPS = {f.__name__: f for f in (environments, utility, learner)}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or GROUPS:
