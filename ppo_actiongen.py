@@ -46,6 +46,7 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 import torch.distributed as dist
+import torch.distributed.nn  # else Adam does, too late, and gloo's threads outlive the end
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
@@ -135,7 +136,6 @@ TABLE_3 = {
 }
 COLUMNS_3 = zip(*TABLE_3.values(), strict=True)
 PRESETS = {column[0]: Args(**dict(zip(TABLE_3, column, strict=True))) for column in COLUMNS_3}
-
 # Our recipe: every difference from Tables 3 and 4, with its reason.
 FAST = {
     "gridworld": dict(
@@ -722,8 +722,7 @@ def train(args: Args) -> dict:
             rewards = (rewards / reward_stats.mean_std()[1]).clamp(-10, 10)
         with torch.no_grad():
             next_value = agent.encode(agent.see(obs)[0])[1]  # (N,)
-        values, dones = batch["value"], batch["done"]
-        batch["advantage"] = gae(rewards, values, dones, next_value, args.gamma)
+        batch["advantage"] = gae(rewards, batch["value"], batch["done"], next_value, args.gamma)
         batch["return"] = batch["advantage"] + batch["value"]
 
         # Learn. Then the normaliser catches up: what collects is what learns.
@@ -923,6 +922,7 @@ def finish(folder: Path, agent: Agent, phases: dict, steps: int, seconds: float)
 
 def plot_curve(folder: Path, results: dict) -> None:
     """Scores over steps as curve.png, raw: not held at their maximum."""
+    os.environ.pop("MPLBACKEND", None)  # a notebook's can end the import
     from matplotlib.figure import Figure  # not pyplot: that would look for a display
 
     rows = csv.DictReader((folder / "metrics.csv").read_text().splitlines())
@@ -1027,8 +1027,7 @@ def main(words: list[str]) -> None:
     # ours: for layers this small a second thread waits more than it works
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 1)))
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        # Keep freed memory for the next array. Cleared pages of the system's instead make CREATE
-        # take 1.2 times as long, with the paper's minibatches 2.3 times.
+        # Keep freed memory for the next array: else CREATE takes 1.2 (paper: 2.3) times as long.
         libc.mallopt(-1, 2**31 - 1), libc.mallopt(-3, 2**31 - 1)  # M_TRIM_, M_MMAP_THRESHOLD
     if words[:1] == ["evaluate"]:
         return evaluate_run(tyro.cli(EvaluateArgs, args=words[1:]))
