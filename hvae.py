@@ -136,7 +136,7 @@ LAPTOP_OF = {  # an environment or a modality
 QUICK_OF = {  # as many observations as a minute of recording allows
     "onehot": dict(updates=2_000),
     "create": dict(updates=1_250, observations=128),
-    "image": dict(updates=750, observations=64),
+    "image": dict(updates=1_000, observations=64),
     "video": dict(updates=200, observations=16),
 }
 
