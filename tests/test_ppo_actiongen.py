@@ -59,8 +59,6 @@ def random_sets(rows, K=5, A=30, seed=0):
 
 
 # ---- the utility ----
-
-
 def naive_logits(agent, code, available):
     """D.3.2 word for word: project c, concatenate [state; action], 2-layer MLP, one logit each."""
     c = agent.action_project(agent.table[available])  # (B, K, H)
@@ -123,7 +121,6 @@ def test_initial_policy_of_the_paper_is_uniform():
 
 
 # ---- distributions ----
-
 METHODS = {}, {"bilinear": True}, {"method": "nearest-neighbor"}, {"method": "continuous"}
 
 
@@ -222,8 +219,6 @@ def test_baselines_choose_what_is_nearest_even_far_from_the_origin(method):
 
 
 # ---- states ----
-
-
 def test_ink_is_the_mean_of_blocks_and_neither_paper_nor_frames_that_do_not_exist():
     rng = np.random.default_rng(0)
     state = torch.as_tensor(rng.integers(0, 256, (2, 3, 84, 84), dtype=np.uint8))
@@ -241,15 +236,12 @@ def test_ink_is_the_mean_of_blocks_and_neither_paper_nor_frames_that_do_not_exis
 
 
 def test_one_hot_states_name_each_of_the_ids_that_there_are():
-    first = np.array([[1, 2, 8, 9, 10], [11, 1, 1, 1, 1]], np.uint8)
-    envs = stand_in(spaces.Box(0, 11, (5,), np.uint8))
-    envs.reset = lambda: ({"state": first}, {})
-    args = replace(ppo.PRESETS["gridworld"], one_hot=True)
-    agent = ppo.Agent(envs, np.zeros((3, 4)), np.arange(3), args)
-    for row in first:
-        named = torch.tensor([[float(cell == i) for cell in row for i in (1, 2, 8, 9, 10, 11)]])
-        code, _ = agent.encode(torch.as_tensor(row[None]))
-        torch.testing.assert_close(code, agent.encoder(named))
+    args, ids = ppo.default_args("gridworld"), [1, 2, 8, 9, 10, 11]
+    envs = ppo.make_envs(args, np.arange(50), 3, 50, 0)
+    agent = ppo.Agent(envs, np.zeros((1024, 4)), np.arange(50), args)
+    state = agent.see(envs.reset()[0])[0]
+    named = [[float(cell == i) for cell in row for i in ids] for row in state.tolist()]
+    torch.testing.assert_close(agent.encode(state)[0], agent.encoder(torch.tensor(named)))
 
 
 def test_running_statistics_equal_those_of_all_data_at_once():
@@ -263,8 +255,6 @@ def test_running_statistics_equal_those_of_all_data_at_once():
 
 
 # ---- PPO's arithmetic ----
-
-
 def test_gae_and_discounted_returns_equal_their_definitions():
     r, v, nv = (torch.randn(s, dtype=torch.float64) for s in ((9, 3), (9, 3), (3,)))
     d = (torch.rand(9, 3) < 0.3).double()
@@ -313,8 +303,6 @@ def test_the_loss_has_the_gradient_of_the_naive_one(clip_vloss):
 
 
 # ---- Tables 3 and 4 ----
-
-
 def test_paper_presets_are_tables_3_and_4():
     table3 = {  # entropy, K, steps, batch; published code: steps per environment and rollout
         "gridworld": (0.05, 50, 40_000_000, 4096, 512),
@@ -351,7 +339,6 @@ def test_numbers_of_parameters_are_those_of_the_published_policies():
 
 
 # ---- whole runs ----
-
 TINY = "--representation engineered --minibatch-size 64 --eval-every 768 --valid-episodes 32"
 TINY += " --eval-episodes 64 --total-timesteps 3072 --device cpu --run-name run"
 SHORT = "--total-timesteps 768 --eval-every 256 --valid-episodes 4 --eval-episodes 8"
@@ -402,12 +389,9 @@ def test_a_run_leaves_what_it_promises(finished):
     files = "args.json metrics.csv checkpoint.pt best.pt results.json curve.png episode.gif"
     assert set(files.split()) <= names and not any(n.startswith(".") for n in names)
     assert any(n.startswith("events.") for n in names)
-    rows = rows_of(folder)
-    assert len(rows) == 12 and rows[-1]["step"] == "3072"
-    assert [bool(r["valid_score"]) for r in rows] == [False, False, True] * 4
+    assert [r["step"] for r in rows_of(folder) if r["valid_score"]] == "768 1536 2304 3072".split()
     results = json.loads((folder / "results.json").read_text())
-    assert results["test"]["episodes"] == 64 and 0 <= results["test"]["score"] <= 1
-    assert results["method"] == "engineered" and results["steps"] == 3072
+    assert results["test"]["episodes"] == 64 and results["method"] == "engineered"
     assert results["published"]["test"] == pytest.approx(0.797, abs=1e-3)
     assert "unseen" in out and out.count("step ") == 4 and "note:" not in out
     best = torch.load(folder / "best.pt", weights_only=True)
@@ -464,50 +448,35 @@ def test_broken_checkpoints_are_refused(finished, tmp_path):
             ppo.load(tmp_path / name)
 
 
-def test_results_survive_a_picture_that_fails(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(ppo, "plot_curve", lambda *_: 1 / 0)
-    small(tmp_path)
-    out = capsys.readouterr().out
-    assert "note: a picture is missing: ZeroDivisionError" in out and "unseen" in out
-    assert (tmp_path / "run" / "results.json").exists()
-
-
 def test_a_run_that_diverges_says_so(tmp_path):
     with pytest.raises(ValueError, match="learning_rate 1e\\+30 is too high"):
         small(tmp_path, "--learning-rate", "1e30")
 
 
 # ---- options ----
-
 REFUSED = """gridworld --num-available 0; num_available 0 is too small
 gridworld --seed -1; seed -1 is too small
 gridworld --num-available 600; 600 on offer out of 512
 gridworld --eval-available 300; 300 on offer out of 256
 gridworld --total-timesteps 10; one rollout takes 2048
 gridworld --minibatch-size 7; multiples
-gridworld --split nonsense; nonsense
 gridworld --representation missing.npz; missing.npz
 gridworld --finetune nowhere; nowhere/best.pt is no checkpoint
 create --task bogus; bogus
-stacking --placement 3d; 3d
 chess; chess
 gridworld --task push; task push has no effect
 gridworld --no-subgoal-reward; subgoal_reward False has no effect
-gridworld --placement 1d; placement
+stacking --placement none --aux-conditioned; aux_conditioned
 gridworld --fully-observable; fully_observable
 gridworld --ink; ink
-gridworld --aux-conditioned; aux_conditioned
-stacking --placement none --aux-conditioned; aux_conditioned
 recsys --one-hot; one_hot
 recsys --no-small-gains; small_gains
 recsys --representation engineered-5d; representation
 gridworld --fixed-set-size 60; fixed_set_size
-recsys --method nearest-neighbor --fixed-set-size 60; fixed_set_size
 gridworld --no-subsample --num-available 7; num_available
 gridworld --method nearest-neighbor --no-subsample; subsample
 gridworld --adapt --eval-available 7; eval_available
 gridworld --method continuous --bilinear; bilinear
-gridworld --method continuous --small-gains; small_gains
 gridworld --ent-coef 0 --ent-floor 0.5; ent_floor
 gridworld --representation engineered --hvae-recipe quick; hvae_recipe
 gridworld --representation engineered --modality onehot; modality"""
@@ -522,11 +491,11 @@ def test_bad_and_useless_options_are_one_line_and_leave_nothing(tmp_path, case, 
     assert "\n" not in str(e.value) and not any(tmp_path.iterdir())
 
 
-def test_help_works_with_and_without_an_environment(capsys):
-    for line in ("", "--help", "recsys --help", "evaluate --help"):
-        with pytest.raises(SystemExit) as e:
-            ppo.main(line.split())
-        assert e.value.code == 0 and "usage" in capsys.readouterr().out
+@pytest.mark.parametrize("line", ["", "--help", "recsys --help", "evaluate --help"])
+def test_help_works_with_and_without_an_environment(line, capsys):
+    with pytest.raises(SystemExit) as e:
+        ppo.main(line.split())
+    assert e.value.code == 0 and "usage" in capsys.readouterr().out
 
 
 def parse(line):
@@ -538,14 +507,10 @@ def parse(line):
 
 
 NAMES = """gridworld; gridworld-ours-s0
-gridworld --quick; gridworld-ours-quick-s0
 gridworld --recipe paper --quick --seed 3; gridworld-ours-quick-paper-s3
 gridworld --split-seed 3; gridworld-ours-split_seed-3-s0
 gridworld --hvae-recipe paper; gridworld-ours-hvae_recipe-paper-s0
-gridworld --modality onehot; gridworld-ours_alternate_modality-s0
-gridworld --ent-coef 0; gridworld-ours_no_entropy-s0
-gridworld --no-subsample --representation vae; \
-gridworld-ours_no_subsampling-representation-vae-s0
+gridworld --ent-coef 0 --modality onehot; gridworld-ours_no_entropy-modality-onehot-s0
 gridworld --representation a/my.npz; gridworld-ours-representation-a_my.npz-s0
 gridworld --adapt; gridworld-ours_from_scratch-s0
 gridworld --finetune runs/x --method nearest-neighbor; gridworld-nearest_neighbor_finetuned-s0
@@ -554,8 +519,7 @@ recsys --no-bilinear --fully-observable; recsys-full-ours-s0
 recsys --method nearest-neighbor; recsys-nearest_neighbor-s0
 create --task seesaw --split full; create-seesaw-ours_full_split-s0
 create --no-aux-conditioned; create-push-ours-aux_conditioned-False-s0
-create --recipe paper --aux-conditioned; create-push-ours_conditioned_auxiliary-paper-s0
-stacking --placement 2d; stacking-ours_2d_place-s0"""
+create --recipe paper --aux-conditioned; create-push-ours_conditioned_auxiliary-paper-s0"""
 
 
 def test_names_tell_runs_apart():
@@ -571,14 +535,9 @@ def test_published_numbers_stand_only_beside_what_was_published():
     }  # fmt: skip
     for line, score in there.items():
         assert ppo.published_scores(parse(line))["test"] == pytest.approx(score, abs=1e-3), line
-    for line in (
-        "recsys",  # the bilinear utility is ours
-        "create --split analysis",
-        "create --split full --method nearest-neighbor",  # two changes at once
-        "gridworld --ent-coef 0 --representation engineered",
-        "gridworld --representation mine.npz",
-        "gridworld --adapt",
-    ):
+    # A utility, a split, a table or a phase that is not published; two changes at once.
+    for line in ("recsys", "create --split analysis", "gridworld --representation mine.npz",
+                 "gridworld --adapt", "create --split full --ent-coef 0"):  # fmt: skip
         assert ppo.published_scores(parse(line)) == {}, line
 
 
@@ -607,13 +566,12 @@ def test_an_encoder_that_fails_gives_the_name_back(tmp_path, monkeypatch):
 
 
 # ---- methods, evaluation, adaptation ----
-
-
-@pytest.mark.parametrize("line, K", [("--method nearest-neighbor", 512), ("--method continuous", 50),
-                                     ("--no-subsample --fixed-set-size 60", 60),
-                                     ("--recipe paper --ent-coef 0", 50)])  # fmt: skip
+@pytest.mark.parametrize(
+    "line, K",
+    [("method nearest-neighbor", 512), ("method continuous", 50), ("no-subsample", 512)],
+)
 def test_baselines_and_ablations_run_and_are_evaluated(tmp_path, line, K, capsys):
-    small(tmp_path, *line.split())
+    small(tmp_path, *f"--{line}".split())
     ppo.main(["evaluate", str(tmp_path / "run"), "--actions", "train", "--episodes", "8"])
     out = capsys.readouterr().out
     assert "unseen" in out and f"train actions, K={K}, 8 episodes" in out
@@ -707,7 +665,6 @@ def test_adaptation_is_to_the_whole_test_set_from_scratch_or_from_a_run(
 
 
 # ---- torchrun ----
-
 JOINT = """import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
 import torch.distributed as dist, ppo_actiongen as ppo, test_ppo_actiongen as test
 dist.init_process_group("gloo")
@@ -727,7 +684,7 @@ def joint_update(rank, world):
     flat = dict(state=state, available=sets, logprob=logprob, value=value) | action
     flat |= {"advantage": 3 + torch.randn(T * N), "return": torch.randn(T * N)}
     batch = {k: v.detach().unflatten(0, (T, N))[:, mine] for k, v in flat.items()}
-    ppo.update(agent, torch.optim.Adam(agent.parameters(), lr=1e-3), batch, 0.01, args)
+    ppo.update(agent, torch.optim.Adam(agent.parameters(), 1e-3, eps=1e-5), batch, 0.01, args)
     stats = ppo.RunningMeanStd((7,))
     stats.update(batch["state"].flatten(0, 1))
     return [start, torch.cat([p.detach().flatten() for p in agent.parameters()]), stats.sums]
