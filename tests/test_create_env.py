@@ -2,9 +2,10 @@
 
 import dataclasses
 import math
+import re
 import subprocess
 import sys
-import warnings
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -12,17 +13,18 @@ import gymnasium
 import numpy as np
 import pymunk
 import pytest
-from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 import create_env as c
 from create_env import CreateEnv, Placement, Tool
 
-NO_OP = {"choice": 0, "position": np.zeros(2, np.float32)}
+SCRIPT = Path(c.__file__)
+WAIT = {"choice": 0, "position": (0, 0)}
+SPLITS = ("default", "full", "analysis")
 KINDS = list(dict.fromkeys(tool.kind for tool in c.TOOLS))
-EXAMPLES = {kind: [t for t in c.TOOLS[: c._NUM_BASE] if t.kind == kind] for kind in KINDS}
+COARSE = [tool for tool, coarse in zip(c.TOOLS, c.IS_COARSE, strict=True) if coarse]
+EXAMPLES = {kind: [tool for tool in COARSE if tool.kind == kind] for kind in KINDS}
 
 
 def find_tool(kind: str, **values) -> int:
@@ -31,128 +33,119 @@ def find_tool(kind: str, **values) -> int:
     return next(i for i, t in wanted if all(getattr(t, k) == v for k, v in values.items()))
 
 
-def fixed_env(task: str, tool: int, **options) -> CreateEnv:
+def fixed_env(task: str, tool: int = 1, **options) -> CreateEnv:
     """An environment that offers the no-op (0) and one tool (1), just reset."""
-    env = CreateEnv([0, tool], 2, task=task, **options)
+    env = CreateEnv([tool], 2, task=task, **options)
     env.reset(seed=0)
     return env
 
 
-def drop(tool: Tool | None, ball: tuple, velocity=(0.0, 0.0), at=(42.0, 42.0)):
-    """A space with one tool and one ball: (space, tool thing, ball thing)."""
-    space = c.make_space()
-    thing = None
+def drop(tool: Tool | None, ball: tuple, velocity=(0.0, 0.0), at=(42.0, 42.0), steps=0):
+    """A space with one tool and one ball after so many steps: (space, tool, ball)."""
+    space, thing = c.make_space(), None
     if tool is not None:
         thing = c.build(tool, *at, space.static_body)
         space.add(*thing.parts)
     probe = c.build(c.PROBE_BALL, *ball, space.static_body)
     space.add(*probe.parts)
     probe.body.velocity = velocity
+    for _ in range(steps):
+        space.step(c.DT)
     return space, thing, probe
 
 
 # ---- the action set ----
 
-
-def test_counts_of_the_default_split():
-    split = c.split_actions("default", seed=3)
-    assert c.NUM_DEFAULT == 2111
-    assert [len(split[k]) for k in ("train", "valid", "test")] == [1098, 507, 507]
-    assert len(np.unique(np.concatenate(list(split.values())))) == 2111
-
-
-def test_counts_of_the_full_and_analysis_splits():
-    full, analysis = c.split_actions("full"), c.split_actions("analysis")
-    assert [len(ids) for ids in full.values()] == [939, 400, 400]
-    assert len(np.unique(np.concatenate(list(full.values())))) == 1738  # the no-op counts twice
-    assert len(analysis["train"]) == 762
-    pool = np.unique(np.concatenate(list(analysis.values())))
-    assert len(pool) == 7556
-    held_out = np.setdiff1d(pool, analysis["train"])
-    gaps = c.angle_gaps(held_out, analysis["train"])
-    counts = [int((gaps >= degrees).sum()) for degrees in (15, 12, 9, 6, 3)]
-    assert counts == [926, 2393, 3860, 5327, 6794]
-    assert not c.angle_gaps(analysis["train"], analysis["train"]).any()
-
-
-CLASS_TABLE = {  # class: (15-degree tools, default train, full train, full held out)
-    "Ramp": (180, 90, 180, 0),
-    "Trampoline": (180, 90, 180, 0),
-    "Ball": (20, 0, 20, 0),
-    "Bouncy Ball": (20, 0, 20, 0),
-    "Triangle": (168, 84, 0, 168),
-    "Bouncy Triangle": (168, 84, 0, 168),
-    "Square": (105, 63, 0, 0),
-    "Bouncy Square": (105, 63, 0, 0),
-    "Pentagon": (105, 63, 0, 0),
-    "Bouncy Pentagon": (105, 63, 0, 0),
-    "Hexagon": (84, 42, 0, 0),
-    "Bouncy Hexagon": (84, 42, 0, 0),
-    "Lever": (55, 0, 0, 55),
-    "Hinged See-saw": (90, 45, 90, 0),
-    "See-saw": (160, 80, 160, 0),
-    "Cannon": (168, 84, 168, 0),
-    "Fan": (168, 84, 0, 168),
-    "Conveyor Belt": (120, 0, 0, 120),
-    "Funnel": (120, 60, 0, 120),
-    "Bucket": (120, 60, 120, 0),
-    "No-op": (1, 1, 1, 1),
+# fmt: off
+# class: first id, 15-degree tools, default train, full train, full held out (published lists)
+CLASS_TABLE = {
+    "Ramp": (1, 180, 90, 180, 0), "Trampoline": (181, 180, 90, 180, 0),
+    "Triangle": (361, 168, 84, 0, 168), "Bouncy Triangle": (529, 168, 84, 0, 168),
+    "Square": (697, 105, 63, 0, 0), "Bouncy Square": (802, 105, 63, 0, 0),
+    "Pentagon": (907, 105, 63, 0, 0), "Bouncy Pentagon": (1012, 105, 63, 0, 0),
+    "Hexagon": (1117, 84, 42, 0, 0), "Bouncy Hexagon": (1201, 84, 42, 0, 0),
+    "Hinged See-saw": (1285, 90, 45, 90, 0), "See-saw": (1375, 160, 80, 160, 0),
+    "Cannon": (1535, 168, 84, 168, 0), "Fan": (1703, 168, 84, 0, 168),
+    "Funnel": (1871, 120, 60, 0, 120), "Bucket": (1991, 120, 60, 120, 0),
+    "Ball": (2111, 20, 0, 20, 0), "Bouncy Ball": (2131, 20, 0, 20, 0),
+    "Lever": (2151, 55, 0, 0, 55), "Conveyor Belt": (2206, 120, 0, 0, 120),
 }
+# fmt: on
 
 
 def test_class_table():
     default, full = c.split_actions("default", 1), c.split_actions("full", 1)
     held_out = np.concatenate([full["valid"], full["test"]])
-    sets = (range(c._NUM_BASE), default["train"], full["train"], held_out)
+    sets = (np.flatnonzero(c.IS_COARSE), default["train"], full["train"], held_out)
     counts = [Counter(c.TOOLS[i].kind for i in ids) for ids in sets]
-    assert {kind: tuple(count[kind] for count in counts) for kind in CLASS_TABLE} == CLASS_TABLE
+    found = {kind: (find_tool(kind), *(count[kind] for count in counts)) for kind in CLASS_TABLE}
+    assert found == CLASS_TABLE and set(KINDS) == {"No-op", *CLASS_TABLE}
+    labels = c.action_labels()  # Table 1 to the letter
+    train = "Ramp, Trampoline, Ball, Bouncy Ball, See-saw, Cannon, Bucket"
+    test = "Triangle, Bouncy Triangle, Lever, Fan, Conveyor Belt, Funnel"
+    assert set(labels[full["train"]]) == set(train.split(", "))
+    assert set(labels[full["valid"]]) == set(labels[full["test"]]) == set(test.split(", "))
 
 
-def test_tools_are_distinct_and_labelled():
-    assert len(set(c.TOOLS)) == len(c.TOOLS) == c.NUM_ACTIONS == 8359
-    labels = c.action_labels()
-    assert labels.shape == (c.NUM_ACTIONS,)
-    assert set(labels[1 : c.NUM_DEFAULT]) >= {"Ramp", "See-saw", "Bouncy Hexagon", "Bucket"}
-    assert "Hinged See-saw" not in labels
-    assert set(labels[c.split_actions("full")["train"]]) == {*c.FULL_TRAIN, "No-op"}
+def physics_of(tool: Tool) -> tuple:
+    """All that makes a tool behave as it does, whatever its id and its class are called."""
+    thing = c.build(tool, 42.0, 42.0, pymunk.Space().static_body)
+    shape, kind = thing.shape, thing.kind
+    corners = sorted((round(x, 6), round(y, 6)) for x, y in thing.corners)
+    aimed = kind.contact in (c.Contact.CANNON, c.Contact.FAN, c.Contact.FUNNEL, c.Contact.BUCKET)
+    what = (*corners, shape.elasticity, shape.friction, shape.collision_type, shape.radius)
+    more = (tool.max_angle, tool.mass, tool.on_left, tool.force, tool.speed, tool.angle * aimed)
+    return (*what, *more, tool.damping * (kind.family == "plank"))
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10**6), split=st.sampled_from(c.SPLITS))
-def test_splits_share_nothing_but_the_no_op(seed, split):
-    parts = c.split_actions(split, seed)
-    for ids in parts.values():
-        assert ids.dtype == np.int64 and (np.diff(ids) > 0).all()
-    train, valid, test = parts.values()
-    assert not set(train) & set(valid) and not set(valid) & set(test)
-    assert set(train) & set(test) == {0}
-    if split == "default":
-        values = c.primary_values()
-        for group in c.SPLIT_GROUPS:
-            angles = [
-                {values[i] for i in ids if c.TOOLS[i].kind in group}
-                for ids in (train, np.concatenate([valid, test]))
-            ]
-            assert angles[0] and angles[1] and not angles[0] & angles[1]
+def test_no_two_tools_are_one_tool_so_no_split_has_a_twin_on_both_sides():
+    assert len({physics_of(tool) for tool in c.TOOLS}) == len(c.TOOLS)
 
 
-def test_splits_follow_the_seed():
-    a, b, other = (c.split_actions("default", seed) for seed in (5, 5, 6))
-    assert all(np.array_equal(a[k], b[k]) for k in a)
-    assert not np.array_equal(a["train"], other["train"])
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_splits_have_the_papers_sizes_and_share_nothing(seed):
+    sizes = {"default": [1097, 507, 506], "full": [938, 400, 399], "analysis": [761, 3397, 3397]}
+    assert sum(sizes["default"]) + 1 == 2111 and sum(sizes["full"]) + 2 == 1739  # with the no-op
+    for split in SPLITS:
+        parts = c.split_actions(split, seed)
+        assert [len(ids) for ids in parts.values()] == sizes[split]
+        assert all(ids.dtype == np.int64 and (np.diff(ids) > 0).all() for ids in parts.values())
+        everything = np.concatenate(list(parts.values()))
+        assert len(np.unique(everything)) == len(everything) and c.NO_OP not in everything
+    with pytest.raises(ValueError, match="unknown split 'half'"):
+        c.split_actions("half")
+    parts, again = (c.split_actions("default", s) for s in (seed, seed))
+    other = c.split_actions("default", seed + 1)["train"]
+    assert np.array_equal(parts["train"], again["train"]) and any(parts["train"] != other)
+    group = np.array([c.KINDS[tool.kind].group for tool in c.TOOLS])
+    held_out = np.concatenate([parts["valid"], parts["test"]])
+    for name in set(group) - {""}:  # training and held-out tools of one group share no angle
+        a, b = (set(c.DEGREES[i[group[i] == name]]) for i in (parts["train"], held_out))
+        assert a and b and not a & b
 
 
-def test_engineered_representations():
+def test_angle_gaps_of_the_analysis_as_counted_class_by_class():
+    parts = c.split_actions("analysis")
+    gaps = c.angle_gaps(np.concatenate([parts["valid"], parts["test"]]), parts["train"])
+    assert [int((gaps >= d).sum()) for d in (15, 12, 9, 6, 3)] == [926, 2393, 3860, 5327, 6794]
+    ramp = [find_tool("Ramp", angle=angle) for angle in (0, 177, 90)]
+    assert c.angle_gaps(ramp, ramp[:1]).tolist() == [0.0, 3.0, 90.0]  # 180 is 0 again
+    assert c.angle_gaps([find_tool("Fan")], ramp).tolist() == [np.inf]
+    with pytest.raises(ValueError, match="action ids lie in 0.."):
+        c.angle_gaps([1], [c.NUM_ACTIONS])
+
+
+def test_engineered_representations_are_standardised_as_published():
     features = c.engineered_representations()
     assert features.shape == (c.NUM_ACTIONS, 30) and features.dtype == np.float32
     assert (features[:, :21].sum(axis=1) == 1).all()
-    base = features[: c._NUM_BASE, 21:].astype(np.float64)
-    assert np.allclose(base.mean(axis=0), 0, atol=1e-5) and np.allclose(base.std(axis=0), 1, 1e-4)
+    coarse = features[c.IS_COARSE, 21:].astype(np.float64)
+    assert np.allclose(coarse.mean(0), 0, atol=1e-5) and np.allclose(coarse.std(0), 1, 1e-4)
     # published means and deviations are over 2,366 tools: ours and 40 boxes of no split
-    boxes = [
-        (e, 0, s, 0, 0, 0, 0, 0, 0) for e in c.SOFT_FINE + c.BOUNCY_FINE for s in (5, 8, 11, 14)
-    ]
-    numbers = np.array([t[1:] for t in c.TOOLS[: c._NUM_BASE]] + boxes, np.float64)
+    levels = c.BALLS["elasticity"] + c.BOUNCY_BALLS["elasticity"]
+    boxes = [(e, 0, s, 0, 0, 0, 0, 0, 0) for e in levels for s in (5, 8, 11, 14)]
+    numbers = np.array([t[1:] for t in COARSE] + boxes, np.float64)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])
     mean = [0.37473, 1.21229, 8.31530, 0.20805, 0.06067, 0.54100, 0.03381, 11.71598, 0]
     std = [0.43465, 1.50205, 6.28853, 0.40996, 0.21500, 2.32116, 0.18075, 30.48934, 0.87706]
@@ -160,903 +153,495 @@ def test_engineered_representations():
     assert np.allclose(numbers.std(axis=0), std, atol=6e-6)
 
 
+def test_a_new_class_is_one_line_of_the_table(tmp_path):
+    """The docstring's Octagon, written into a copy of the file."""
+    (line,) = re.findall(r'^    ("Octagon": .*)$', c.__doc__, re.M)
+    source, spot = SCRIPT.read_text(), '    # level objects\n    "Target"'
+    assert source.count(spot) == 1
+    (tmp_path / "more_env.py").write_text(source.replace(spot, f"    {line}\n{spot}"))
+    code = """
+import create_env as c, more_env as m, numpy as np
+assert [tuple(t) for t in m.TOOLS[:8359]] == [tuple(t) for t in c.TOOLS] and m.NUM_ACTIONS == 8422
+for split in ("default", "full", "analysis"):
+    old, now = c.split_actions(split, 3), m.split_actions(split, 3)
+    assert np.array_equal(old["train"], now["train"][now["train"] < 8359])
+    train, valid, test = (int((ids >= 8359).sum()) for ids in now.values())
+    assert (train, valid + test) == ((42, 21) if split == "default" else (0, 0))
+    assert split != "default" or min(valid, test) >= 4
+env = m.CreateEnv([8400], 2)
+env.reset(seed=0)
+env.step({"choice": 1, "position": (-0.2, 0.3)})
+assert env.placement.name == "PLACED" and m.engineered_representations().shape == (8422, 31)
+assert m.action_labels()[8400] == "Octagon" and m.action_observations([8400], 2).any()
+"""
+    code = f"import sys; sys.path[:0] = {[str(tmp_path), str(SCRIPT.parent)]!r}" + code
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_new_task_is_the_docstrings_example(monkeypatch):
+    example = c.__doc__[c.__doc__.index('    TASKS["gap"]') : c.__doc__.index("A tool of your own")]
+    monkeypatch.setattr(c, "TASKS", dict(c.TASKS))
+    exec("if True:\n" + example, vars(c))
+    env, seen = CreateEnv(task="gap"), set()
+    for seed in range(3):
+        env.reset(seed=seed)
+        seen.add(env._target.x)
+        assert env._target.y == c.to_units(0.6) and abs(env._target.x - c.to_units(-0.6)) <= 4.2
+    assert len(seen) == 3 and not env.step(WAIT)[2]
+
+
+def test_exceptions_of_contact_rules_are_swallowed(monkeypatch):
+    def broken(arbiter, space, data):
+        raise RuntimeError("lost in the rule")
+
+    seen = []
+    monkeypatch.setattr(sys, "unraisablehook", seen.append)  # by default it prints
+    space, _, ball = drop(Tool("Ramp", 0.5, 0, 22), (42.0, 48.0))
+    space.on_collision(c.Contact.MOVING, c.Contact.PLAIN, begin=broken)
+    for _ in range(100):
+        space.step(c.DT)
+    assert seen and "lost in the rule" in str(seen[0].exc_value) and ball.body.position.y > 46
+
+
 # ---- the physics of single tools ----
 
 
 def test_free_fall():
-    space, _, ball = drop(None, (42.0, 80.0))
-    for k, fallen in enumerate((1.733, 7.02, 15.87, 28.27), start=1):
-        for _ in range(40):
-            space.step(c.DT)
-        assert 80 - ball.body.position.y == pytest.approx(2 / 900 * (40 * k) * (40 * k - 1) / 2)
-        assert 80 - ball.body.position.y == pytest.approx(fallen, abs=0.02)
+    for k, fallen in enumerate((1.733, 7.02, 15.87, 28.27), start=1):  # units after k actions
+        y = drop(None, (42.0, 80.0), steps=40 * k)[2].body.position.y
+        assert 80 - y == pytest.approx(2 / 900 * (40 * k) * (40 * k - 1) / 2)
+        assert 80 - y == pytest.approx(fallen, abs=0.02)
 
 
 @pytest.mark.parametrize(
     "elasticity, apexes", [(0.8, (8.31, 5.30)), (1.0, (13, 13)), (1.2, (18.7, 26.9))]
 )
 def test_trampoline_apexes_scale_with_elasticity_squared(elasticity, apexes):
-    tool = Tool("Trampoline", elasticity, 0, 22)
-    space, _, ball = drop(tool, (42.0, 42 + 1 + 4 + 13))
+    space, _, ball = drop(Tool("Trampoline", elasticity, 0, 22), (42.0, 42 + 1 + 4 + 13))
     tops, rising = [], False
-    for _ in range(3000):
+    while len(tops) < 2:
         space.step(c.DT)
         up = ball.body.velocity.y > 0
-        if rising and not up:
-            tops.append(ball.body.position.y - 47)
+        tops += [ball.body.position.y - 47] if rising and not up else []
         rising = up
-    assert tops[:2] == pytest.approx(apexes, abs=0.45)
+    assert tops == pytest.approx(apexes, abs=0.45)
 
 
 @pytest.mark.parametrize("angle, force", [(0, 60), (105, 100), (240, 120)])
-def test_cannon_puts_the_ball_at_its_mouth_and_shoots(angle, force):
-    space, cannon, ball = drop(Tool("Cannon", angle=angle, force=force), (42.0, 42.0))
-    space.step(c.DT)
+def test_cannon_shoots_from_its_mouth_and_fan_adds_force_over_300_per_step(angle, force):
     aim = math.radians(angle)
+    ball = drop(Tool("Cannon", angle=angle, force=force), (42.0, 42.0), steps=1)[2]
     mouth = (42 + 5 * math.cos(aim), 42 + 3.65 * math.sin(aim))
     assert tuple(ball.body.position) == pytest.approx(mouth)
     shot = (force / 10 * math.cos(aim), force / 10 * math.sin(aim) - 2 / 30)
     assert tuple(ball.body.velocity) == pytest.approx(shot)
-
-
-@pytest.mark.parametrize("angle, force", [(0, 30), (90, 120), (225, 75)])
-def test_fan_adds_force_over_300_per_step(angle, force):
     space, _, ball = drop(Tool("Fan", angle=angle, force=force), (42.0, 42.0))
     ball.body.angle = 1.0  # the wind does not turn with the ball
     for k in range(1, 4):
         space.step(c.DT)
-        aim = math.radians(angle)
         gain = (k * force / 300 * math.cos(aim), k * (force / 300 * math.sin(aim) - 2 / 30))
         assert tuple(ball.body.velocity) == pytest.approx(gain)
 
 
-@pytest.mark.parametrize("speed", [-6, 1, 5])
-def test_belt_carries_at_its_speed(speed):
-    space, _, ball = drop(Tool("Conveyor Belt", size=24, speed=speed), (42.0, 46.9))
-    for _ in range(20):
-        y = ball.body.position.y
-        space.step(c.DT)
-    assert ball.body.velocity.x == speed
-    assert ball.body.velocity.y == pytest.approx(-2 / 30)
-    assert y - ball.body.position.y == pytest.approx(2 / 900)
-
-
-def test_ladder_carries_up():
-    space, _, ball = drop(Tool("Ladder", angle=95, size=20, speed=4.0), (42.0, 40.0))
-    for _ in range(5):
-        space.step(c.DT)
+def test_belts_and_ladders_carry_at_their_speed():
+    for speed in (-6, 1, 5):
+        belt, place = Tool("Conveyor Belt", size=24, speed=speed), (42.0, 46.9)
+        before, after = (drop(belt, place, steps=k)[2].body for k in (19, 20))
+        assert tuple(after.velocity) == (speed, pytest.approx(-2 / 30))
+        assert before.position.y - after.position.y == pytest.approx(2 / 900)
+    ladder = Tool("Ladder", angle=95, size=20, speed=4.0)
+    ball = drop(ladder, (42.0, 40.0), steps=5)[2]
     assert tuple(ball.body.velocity) == pytest.approx((-1.3945, 3.9848 - 2 / 30), abs=1e-4)
 
 
-def test_funnel_lets_the_ball_out_at_its_nozzle():
+def test_funnel_lets_the_ball_out_at_its_nozzle_and_is_solid_from_below():
     space, _, ball = drop(Tool("Funnel", angle=0, size=11), (43.0, 60.0))
-    ys = []
-    for _ in range(400):
+    path = [(43.0, 60.0)]
+    while path[-1][1] > 25:
         space.step(c.DT)
-        ys.append(tuple(ball.body.position))
-    jump = next(p for a, p in zip(ys, ys[1:], strict=False) if a[1] - p[1] > 3)
+        path.append(tuple(ball.body.position))
+    jump = next(b for a, b in zip(path, path[1:], strict=False) if a[1] - b[1] > 3)
     assert jump == pytest.approx((42.0, 31.0), abs=0.2)
-    assert ys[-1][0] == pytest.approx(42.0, abs=0.5) and ys[-1][1] < 25
-
-
-def test_funnel_is_solid_from_below():
+    assert path[-1][0] == pytest.approx(42.0, abs=0.5)
     space, funnel, ball = drop(Tool("Funnel", angle=180, size=11), (42.3, 70.0))
     for _ in range(300):
         space.step(c.DT)
         assert math.dist(ball.body.position, funnel.corners[1]) > 3.5  # rolls off the tip
 
 
-@pytest.mark.parametrize("radius", [3, 11])
-def test_bucket_holds_a_ball_for_good(radius):
-    space, bucket, ball = drop(Tool("Bucket", angle=0, size=radius), (42.4, 60.0))
-    for _ in range(3000):
-        space.step(c.DT)
-    assert ball.holder is bucket
-    assert tuple(ball.body.position) == pytest.approx((42.0, 42.0), abs=0.01)
-    assert ball.body.velocity.length < 0.1
-
-
 @pytest.mark.parametrize(
-    "other, x, y",
-    [(Tool("Funnel", size=11), 42.0, 34.0), (Tool("Cannon", angle=270, force=100.0), 38.0, 34.0)],
+    "other, x",
+    [(None, 0), (Tool("Funnel", size=11), 42), (Tool("Cannon", angle=270, force=100), 38)],
 )
-def test_what_a_bucket_holds_stays_there_whatever_else_touches_it(other, x, y):
-    space, _, ball = drop(other, (42.2, 52.0), at=(x, y))
+def test_bucket_holds_a_ball_for_good_whatever_else_touches_it(other, x):
+    space, _, ball = drop(other, (42.2, 52.0), at=(x, 34.0))
     bucket = c.build(Tool("Bucket", angle=0, size=3), 42.0, 42.0, space.static_body)
     space.add(*bucket.parts)
-    for _ in range(400):
+    for _ in range(3000):
         space.step(c.DT)
-    assert ball.holder is bucket
+    assert ball.holder is bucket and ball.body.velocity.length < 0.1
     assert tuple(ball.body.position) == pytest.approx((42.0, 42.0), abs=0.1)
-
-
-@pytest.mark.parametrize("task", c.TASKS)
-def test_steps_straight_into_the_library_are_the_same_steps(task, monkeypatch):
-    """`advance` against a loop of Space.step: same pictures, rewards and ends."""
-
-    def play():
-        env, seen = CreateEnv(num_available=60, task=task), []
-        obs, _ = env.reset(seed=3)
-        rng = np.random.default_rng(0)
-        for _ in range(40):
-            action = {"choice": int(rng.integers(60)), "position": rng.uniform(-1, 1, 2)}
-            obs, reward, terminated, truncated, _ = env.step(action)
-            seen.append((obs["state"].tobytes(), reward, terminated, truncated))
-            if terminated or truncated:
-                env.reset()
-        return seen
-
-    direct = play()
-    assert c.chipmunk is not None  # else this test compares nothing
-    monkeypatch.setattr(c, "chipmunk", None)
-    assert play() == direct
 
 
 @pytest.mark.parametrize("kind", ["Hinged See-saw", "See-saw"])
 def test_see_saws_keep_their_limit_and_their_centre(kind):
-    rng = np.random.default_rng(0)
-    for tool in rng.permutation(len(EXAMPLES[kind]))[:12]:
-        tool = EXAMPLES[kind][tool]
+    for i in np.random.default_rng(0).permutation(len(EXAMPLES[kind]))[:12]:
+        tool = EXAMPLES[kind][i]
+        start = math.atan2(*c.outline(tool)[1][::-1])
         for dx in (-6.0, 5.0):
             space, plank, _ = drop(tool, (42 + dx, 60.0), (0, -25.0))
             for _ in range(200):
                 space.step(c.DT)
-                tilt = plank.body.angle + math.atan2(plank.corners[1][1], plank.corners[1][0])
-                assert abs(math.degrees(tilt)) <= tool.max_angle + 10
+                assert abs(math.degrees(plank.body.angle + start)) <= tool.max_angle + 10
                 assert math.dist(plank.body.position, (42, 42)) < 1
+        if kind == "See-saw":  # starts low on the side of its weight, and stays there
+            _, right_end, weight = c.outline(tool)
+            assert (right_end[1] < 0) == tool.on_left == (weight[0] > 0) and weight[1] < 0
+            assert abs(drop(tool, (42.0, 500.0), steps=300)[1].body.angle) < math.radians(3)
 
 
-def test_weighted_see_saw_starts_low_on_the_weights_side_and_stays():
-    for left in (True, False):
-        tool = Tool("See-saw", size=20, max_angle=35, mass=10, on_left=left, friction=1.0)
-        space = c.make_space()
-        plank = c.build(tool, 42, 42, space.static_body)
-        space.add(*plank.parts)
-        right_end, weight = plank.corners[1], plank.corners[2]
-        assert (right_end[1] < 0) == left and weight[1] < 0 and (weight[0] > 0) == left
-        for _ in range(300):
-            space.step(c.DT)
-        assert abs(plank.body.angle) < math.radians(3)
-
-
-def test_lever_damps_a_ball_that_lies_on_it():
-    speeds = []
-    for friction in (1.0, 1.1):
-        tool = Tool("Lever", size=30, friction=friction)
-        space, _, ball = drop(tool, (42.0, 46.0), (3.0, 0.0))
-        for _ in range(30):
-            space.step(c.DT)
-        speeds.append(ball.body.velocity.x)
-    assert speeds[0] > 2.5 and speeds[1] < 0.5 * speeds[0]
-
-
-def test_ball_tools_give_no_spin():
-    space, _, ball = drop(Tool("Ball", 0.5, size=9), (45.0, 58.0))
-    for _ in range(200):
-        space.step(c.DT)
-    assert abs(ball.body.angular_velocity) < 1e-12 and ball.body.velocity.x > 0.5
+def test_levers_damp_a_ball_and_ball_tools_give_no_spin():
+    free, damped = (
+        drop(Tool("Lever", size=30, damping=d), (42.0, 46.0), (3.0, 0.0), steps=30)[2].body
+        for d in (1.0, 1.1)
+    )
+    assert free.velocity.x > 2.5 and damped.velocity.x < 0.5 * free.velocity.x
+    ball = drop(Tool("Ball", 0.5, size=9), (45.0, 58.0), steps=200)[2].body
+    assert abs(ball.angular_velocity) < 1e-12 and ball.velocity.x > 0.5
 
 
 # ---- the levels ----
 
-
-def play_no_op(task: str, seed: int = 0) -> dict:
-    env = CreateEnv(task=task)
-    env.reset(seed=seed)
-    while True:
-        *_, terminated, truncated, info = env.step(NO_OP)
-        if terminated or truncated:
-            return info
-
-
-@pytest.mark.parametrize("task", ["collide", "moving", "ladder", "basket", "buckets", "cannon"])
-def test_untouched_balls_are_gone_after_seven_actions(task):
-    info = play_no_op(task)
-    assert info["episode"]["l"] == 7 and info["success"] == 0.0
-    assert info["episode"]["r"] == pytest.approx(0.07)
-
-
-# The 12 levels once more, typed from the published task files independently of `c.TASKS`: kind,
-# place (norm), size (units), angle (degrees), what else it has, half the range of its shift (norm).
-NO, BALL = 0.0, (10, 1.0)  # of a ball: mass and elasticity
+# Checksums of the 12 levels, taken when every number of theirs agreed with a second typing of the
+# published task files.
+# fmt: off
 LEVELS = {
-    "push": [
-        ("Marker", 0.6, 0.75, 4, 0, BALL, 0.2),
-        ("Thin line", 0.1, -0.25, 16, 0, NO, 0.2),
-        ("Thin line", -0.7, -0.75, 16, 0, NO, 0.2),
-        ("Target", 0.1, -0.14, 4, 0, BALL, 0.2),
-        ("Goal star", -0.7, -0.64, 4, 90, NO, 0.2),
-    ],
-    "navigate": [
-        ("Marker", -0.6, 0.75, 4, 0, BALL, 0),
-        ("Thin line", 0.1, -0.35, 16, 0, NO, 0.1),
-        ("Thin line", -0.65, -0.7, 16, 0, NO, 0.2),
-        ("Thin line", -0.5, 0.1, 40, 0, NO, 0),
-        ("Target", 0.1, -0.24, 4, 0, BALL, 0.1),
-        ("Goal star", -0.65, -0.59, 4, 90, NO, 0.2),
-    ],
-    "obstacle": [
-        ("Marker", -0.8, 0.8, 4, 0, BALL, 0.02),
-        ("Thin line", -0.61, 0.39, 35.6, -30, NO, 0),
-        ("Thin line", -0.25, 0.04, 12.7, 90, NO, 0),
-        ("Thin line", 0.07, -0.1, 26, 0, NO, 0),
-        ("Thin line", -0.8, -0.81, 16, 0, NO, 0),
-        ("Thin line", 0.12, -0.59, 16, 0, NO, 0),
-        ("Thin line", -0.34, -0.7, 24.5, 22.5, NO, 0),
-        ("Box", -0.7, 0.3, 5, 0, (30, 0.1), 0),
-        ("Box", -0.7, 0.2, 5, 0, (30, 0.1), 0),
-        ("Thin line", -0.6, 0.18, 15, 90, NO, 0),
-        ("Thin line", -0.8, 0.18, 15, 90, NO, 0),
-        ("Thin line", 0.35, 0.8, 15, 90, NO, 0),
-        ("Box", 0.25, 0.93, 5, 0, (30, 0.1), 0),
-        ("Box", 0.25, 0.83, 5, 0, (30, 0.1), 0),
-        ("Thin line", 0.15, 0.8, 15, 90, NO, 0),
-        ("Target", 0.1, -0.47, 4, 0, BALL, ((-0.02, 0.02), (0, 0))),
-        ("Goal star", -0.9, -0.69, 4, 90, NO, 0),
-    ],
-    "seesaw": [
-        ("Heavy ball", -0.3, 0.5, 4, 0, (30, 0.1), 0.05),
-        ("See-saw", -0.3, -0.1, 30, 0, (30, 1, True), 0),  # limit, weight, its left end is up
-        ("Thin line", 0.1, -0.7, 40, 90, NO, 0),
-        ("Thin line", -0.9, -0.3, 20, 0, NO, 0),
-        ("Target", 0.2, 0.9, 4, 0, BALL, 0.1),
-        ("Goal star", -0.8, -0.8, 4, 90, NO, 0),
-    ],
-    "belt": [
-        ("Conveyor Belt", 0.55, 0.25, 7, 0, -2.5, 0),  # of belts and ladders: speed
-        ("Conveyor Belt", 0.05, 0.2, 7, 0, -2.5, 0),
-        ("Conveyor Belt", -0.3, -0.6, 7, 0, 5, 0),
-        ("Line", 0.41, -0.3, 65, 0, NO, 0),
-        ("Line", -0.34, -0.17, 12.7, 90, NO, 0),
-        ("Target", 0.75, 0.75, 3, 0, BALL, 0.1),
-        ("Goal star", 0.5, -0.7, 4, 90, NO, 0.1),
-    ],
-    "buckets": [
-        ("Thin line", -0.48, -0.99, 45, 0, NO, 0),
-        ("Thin line", -0.75, -0.15, 25, 0, NO, 0),
-        ("Thin line", -0.99, -0.7, 45, 90, NO, 0),
-        ("Thin line", 0.05, -0.7, 45, 90, NO, 0),
-        ("Bucket", 0.05, -0.1, 4, 0, NO, 0),
-        ("Bucket", -0.45, -0.1, 4, 0, NO, 0),
-        ("Target", 0.75, 0.75, 3, 0, BALL, 0.1),
-        ("Goal star", -0.85, -0.85, 4, 90, NO, 0),
-    ],
-    "cannon": [
-        ("Marker", 0.8, 0.75, 4, 0, BALL, 0.1),
-        ("Thin line", -0.1, 0.35, 55, 90, NO, 0),
-        ("Cannon", -0.1, -0.8, 0, 110, 140, 0),  # force
-        ("Thin line", 0.4, 0, 8, 0, NO, 0.05),
-        ("Target", 0.4, 0.11, 4, 0, BALL, 0.05),
-        ("Goal star", -0.7, -0.1, 4, 90, NO, 0.05),
-    ],
-    "collide": [
-        ("Thin line", 0, 0.25, 35, 90, NO, 0),
-        ("Target", 0.6, 0.7, 4, 0, BALL, 0.1),
-        ("Goal ball", -0.6, 0.7, 4, 0, BALL, 0.1),
-    ],
-    "moving": [
-        ("Trampoline", -0.7, -0.75, 16, 0, NO, 0),
-        ("Target", 0.6, 0.75, 4, 0, BALL, 0.2),
-        ("Goal ball", -0.7, 0, 4, 0, BALL, ((0, 0), (-0.5, 0.5))),
-    ],
-    "ladder": [
-        ("Marker", 0.7, 0.75, 4, 0, BALL, 0),
-        ("Thin line", 0.35, -0.2, 5, 0, NO, 0.1),
-        ("Thin line", -0.75, -0.2, 5, 0, NO, 0.2),
-        ("Ladder", -0.1, -0.1, 20, 95, 4, 0),
-        ("Target", 0.35, -0.09, 4, 0, BALL, 0.1),
-        ("Goal star", -0.75, -0.09, 4, 90, NO, 0.2),
-    ],
-    "basket": [
-        ("Ladder", 0.5, -0.4, 15, 95, 4, 0),
-        ("Ladder", -0.05, 0, 15, 95, 4, 0),
-        ("Ladder", -0.55, 0.35, 15, 95, 4, 0),
-        ("Basketball", 0.75, 0.75, 3.5, 0, BALL, 0.1),
-        ("Basket", -0.75, 0.65, 10, 0, NO, 0.1),
-    ],
-    "funnel": [
-        ("Thin line", -0.56, -0.99, 35.5, 0, NO, 0),
-        ("Thin line", -0.88, -0.16, 10, 0, NO, 0),
-        ("Thin line", -0.257, -0.16, 10, 0, NO, 0),
-        ("Thin line", -0.99, -0.7, 45, 90, NO, 0),
-        ("Thin line", -0.15, -0.7, 45, 90, NO, 0),
-        ("Funnel", -0.6, -0.15, 8, -45, NO, 0),
-        ("Thin line", 0.56, -0.99, 35.5, 0, NO, 0),
-        ("Thin line", 0.88, -0.16, 10, 0, NO, 0),
-        ("Thin line", 0.257, -0.16, 10, 0, NO, 0),
-        ("Thin line", 0.99, -0.7, 45, 90, NO, 0),
-        ("Thin line", 0.15, -0.7, 45, 90, NO, 0),
-        ("Funnel", 0.6, -0.15, 8, 45, NO, 0),
-        ("Target", 0, 0.9, 4, 0, BALL, ((-0.2, 0.05), (-0.2, 0.05))),
-        ("Goal star", -0.28, -0.8, 4, 90, NO, 0),
-    ],
+    "push": 945815142, "obstacle": 3172701425, "seesaw": 4051992650, "navigate": 3154427313,
+    "belt": 1074582084, "buckets": 3201478673, "cannon": 2165076, "collide": 2222273804,
+    "moving": 809541232, "ladder": 968353459, "basket": 1719093058, "funnel": 2695790165,
 }
-# Subgoals, boundary, actions, whether the marker must touch the target, reward of the target hit.
-RULES = {
-    "obstacle": ({(0.7, -0.1)}, "RLC", 50, True, 2.0),
-    "seesaw": ({(-0.1, -0.45)}, "RLC", 30, False, 1.0),
-    "belt": ({(-0.6, -0.35), (-0.15, 0.28), (-0.1, -0.5)}, "", 50, False, 1.0),
-    "buckets": ({(-0.2, -0.1)}, "", 30, False, 1.0),
-    "cannon": (set(), "RC", 30, True, 1.0),
-    "collide": (set(), "RLC", 30, False, 1.0),
-    "basket": ({(0.35, -0.05), (-0.15, 0.35)}, "", 40, False, 1.0),
-}
+# fmt: on
 
 
-def peculiar(tool: Tool):
-    """What a level object has beside its size and angle."""
-    if c.KINDS[tool.kind].family in ("ball", "crate"):
-        return tool.mass, tool.elasticity
-    if tool.kind == "See-saw":
-        return tool.max_angle, tool.mass, tool.on_left
-    return tool.speed or tool.force
-
-
-@pytest.mark.parametrize("task", list(c.TASKS))
+@pytest.mark.parametrize("task", list(LEVELS))
 def test_level_is_the_published_one(task):
-    level, still = c.TASKS[task], ((0.0, 0.0), (0.0, 0.0))
-    items = [*level.items, level.target, level.goal]
-    assert len(items) == len(LEVELS[task])
-    for item, (*expected, shift) in zip(items, LEVELS[task], strict=True):
-        tool = item.tool
-        found = [tool.kind, item.x, item.y, tool.size, tool.angle, peculiar(tool)]
-        if tool.kind == "Thin line":  # vertical lines look the same either way up
-            found[4] = abs(tool.angle) if abs(tool.angle) == 90 else tool.angle
-        assert found == expected
-        ranges = shift if isinstance(shift, tuple) else ((-shift, shift),) * 2
-        assert level.shifts.get(item.shift, still) == ranges, tool.kind
-        if tool.kind == "Trampoline":
-            assert tool.elasticity == 1.0
-    found = set(level.subgoals), level.boundary, level.max_actions, level.marker_must_hit
-    assert (*found, level.target_hit_reward) == RULES.get(task, (set(), "", 30, False, 1.0))
-    assert level.goal_on_either_side == (task == "funnel")
-    # What shares a shift stays together: the shelf below a target or a star.
-    shared = [item.shift for item in items if item.shift]
-    pairs = {"push": 2, "navigate": 2, "cannon": 1, "ladder": 2}.get(task, 0)
-    assert len(shared) - len(set(shared)) == pairs
-
-
-def test_untouched_navigate_comes_to_rest_after_twelve_actions():
-    assert play_no_op("navigate")["episode"]["l"] == 12
-
-
-def move_ball(env: CreateEnv, thing, x: float, y: float) -> None:
-    thing.body.position, thing.body.velocity = (x, y), (0.0, 0.0)
-
-
-def test_ball_in_the_level_bucket_stays():
-    env = CreateEnv(task="buckets")
-    env.reset(seed=0)
-    move_ball(env, env._target, c.to_units(0.05), 63.0)
-    for _ in range(12):
-        *_, over, _, info = env.step(NO_OP)
-        if over:
-            break
-    assert tuple(env._target.body.position) == pytest.approx((44.1, 37.8), abs=0.01)
-    assert over and info["success"] == 0.0  # a held ball is at rest
-
-
-def test_ball_in_the_level_funnel_leaves_by_its_nozzle():
-    env = CreateEnv(task="funnel")
-    env.reset(seed=0)
-    move_ball(env, env._target, 16.8, 60.0)
-    while env._target.body.position.y > 30.1:
-        env._space.step(c.DT)
-    assert tuple(env._target.body.position) == pytest.approx((11.143, 30.04), abs=0.05)
-
-
-def test_level_cannon_shoots_at_110_degrees():
-    space = c.make_space()
-    item = next(item for item in c.TASKS["cannon"].items if item.tool.kind == "Cannon")
-    cannon = c.build(item.tool, c.to_units(item.x), c.to_units(item.y), space.static_body)
-    ball = c.build(c.TASKS["cannon"].target.tool, 37.8, 27.0, space.static_body)
-    space.add(*cannon.parts, *ball.parts)
-    while ball.body.velocity.y <= 0:
-        space.step(c.DT)
-    assert tuple(ball.body.position) == pytest.approx((36.09, 11.83), abs=0.01)
-    assert tuple(ball.body.velocity) == pytest.approx((-4.788, 13.156 - 2 / 30), abs=0.01)
-    top = (0.0, 0.0)
-    while ball.body.velocity.y > 0:
-        space.step(c.DT)
-        top = ball.body.position
-    assert tuple(top) == pytest.approx((4.6, 55.1), abs=0.3)
+    level = repr(dataclasses.astuple(c.TASKS[task]))
+    assert zlib.crc32(level.encode()) == LEVELS[task], f"{task} is not the published level"
 
 
 def test_level_shifts_stay_in_range_and_are_shared():
-    env, seen = CreateEnv(task="push"), []
-    for seed in range(60):
-        env.reset(seed=seed)
-        marker, floor = env._things[0], env._things[1]
-        x, y = env._start
+    push, funnel, seen, sides = CreateEnv(task="push"), CreateEnv(task="funnel"), [], set()
+    for seed in range(40):
+        push.reset(seed=seed), funnel.reset(seed=seed)
+        (x, y), floor = push._start, push._things[1]
         assert (x - floor.x, y - floor.y) == pytest.approx((0, 0.11 * 42))
-        seen.append((x / 42 - 1 - 0.1, y / 42 - 1 + 0.14, marker.x / 42 - 1 - 0.6))
-    seen = np.array(seen)
-    assert np.abs(seen).max() <= 0.2 and np.abs(seen).max(axis=0).min() > 0.15
-    sides = set()
-    for seed in range(20):
-        env = CreateEnv(task="funnel")
-        env.reset(seed=seed)
-        sides.add(round(env._goal.x / 42 - 1, 6))
-        shift = np.array(env._start) / 42 - 1 - (0.0, 0.9)
-        assert (shift >= -0.2).all() and (shift <= 0.05).all()
-    assert sides == {-0.28, 0.28}
+        seen.append((x / 42 - 1 - 0.1, y / 42 - 1 + 0.14))
+        sides.add(round(funnel._goal.x / 42 - 1, 6))
+    assert 0.15 < np.abs(seen).max() <= 0.2 and sides == {-0.28, 0.28}
 
 
-# ---- placing tools ----
+def play_no_op(task: str, seed: int = 0) -> tuple[int, float, dict]:
+    """(length, return, last info) of an untouched episode."""
+    env, total = CreateEnv(task=task), 0.0
+    env.reset(seed=seed)
+    for length in range(1, 100):
+        _, reward, terminated, truncated, info = env.step(WAIT)
+        total += reward
+        if terminated or truncated:
+            return length, total, info
+        assert info == {}
 
 
-def test_small_tools_must_be_more_than_0_3_apart():
-    for gap, outcome in ((0.29, Placement.BLOCKED_BY_TOOL), (0.31, Placement.PLACED)):
+def test_untouched_balls_are_gone_after_seven_actions_and_navigate_rests_after_twelve():
+    for task in ("collide", "moving", "ladder", "basket", "buckets", "cannon"):
+        assert play_no_op(task) == (7, pytest.approx(0.07), {"success": 0.0})
+    assert play_no_op("navigate")[0] == 12
+
+
+def move_ball(thing, x: float, y: float) -> None:
+    thing.body.position, thing.body.velocity = (x, y), (0.0, 0.0)
+
+
+def test_ball_in_the_level_bucket_is_at_rest():
+    env, over = fixed_env("buckets"), False
+    move_ball(env._target, c.to_units(0.05), 63.0)
+    while not over:
+        *_, over, _, info = env.step(WAIT)
+    assert tuple(env._target.body.position) == pytest.approx((44.1, 37.8), abs=0.01)
+    assert info["success"] == 0.0 and env._actions < 30
+
+
+# ---- placing tools, rewards, ends ----
+
+
+def test_small_tools_must_be_more_than_0_3_apart_and_shapes_must_not_touch():
+    for gap, outcome in ((0.29, "TOO_CLOSE"), (0.31, "PLACED")):
         env = fixed_env("moving", find_tool("Triangle", size=3))
         for x in (-0.2, -0.2 + gap):
-            *_, info = env.step({"choice": 1, "position": (x, 0.5)})
-        assert info["placement"] == outcome
+            env.step({"choice": 1, "position": (x, 0.5)})
+        assert env.placement.name == outcome
+    for distance, outcome in ((6.9, "BLOCKED"), (7.1, "PLACED")):  # radii of 3 and 4
+        env = fixed_env("moving", find_tool("Ball", size=3))
+        x, y, _ = env._goal.pose()
+        env.step({"choice": 1, "position": ((x + distance) / 42 - 1, y / 42 - 1)})
+        assert env.placement.name == outcome
 
 
 @pytest.mark.parametrize("task", ["basket", "seesaw", "push", "obstacle"])
 def test_goals_and_subgoals_block_tools(task):
     env = fixed_env(task, find_tool("Triangle", size=3))
     for thing in (env._goal, *env._subgoals):
-        x, y = (value / 42 - 1 for value in thing.pose()[:2])
-        *_, info = env.step({"choice": 1, "position": (x, y)})
-        assert info["placement"] == Placement.BLOCKED_BY_SHAPE
-    assert not env._centres
-
-
-def test_shape_query_agrees_with_distances():
-    """Blocked exactly when a small round tool touches the round goal ball (radii 3 + 4)."""
-    ball_tool = find_tool("Ball", size=3)
-    for distance, outcome in ((6.9, Placement.BLOCKED_BY_SHAPE), (7.1, Placement.PLACED)):
-        env = fixed_env("moving", ball_tool)
-        x, y, _ = env._goal.pose()
-        *_, info = env.step({"choice": 1, "position": ((x + distance) / 42 - 1, y / 42 - 1)})
-        assert info["placement"] == outcome
+        env.step({"choice": 1, "position": (thing.x / 42 - 1, thing.y / 42 - 1)})
+        assert env.placement == Placement.BLOCKED and not env._centres
 
 
 def test_outcomes_and_their_rewards():
     env = fixed_env("collide", find_tool("Ramp"))
-    cases = (
-        ((0, (0.5, 0.5)), Placement.NO_OP, 0.01),
-        ((1, (-0.5, -0.5)), Placement.PLACED, 0.01),
-        ((1, (-0.5, -0.6)), Placement.BLOCKED_BY_TOOL, 0.0),
-        ((1, (0.0, 0.25)), Placement.BLOCKED_BY_SHAPE, 0.0),
-        ((1, (1.01, 0.0)), Placement.OUTSIDE, 0.0),
-    )
-    for (choice, position), outcome, reward in cases:
-        _, r, _, _, info = env.step({"choice": choice, "position": position})
-        assert info["placement"] == outcome and r == pytest.approx(reward)
-
-
-# ---- rewards and ends ----
+    for choice, position, outcome, reward in (
+        (0, (0.5, 0.5), "WAITED", 0.01),
+        (1, (-0.5, -0.5), "PLACED", 0.01),
+        (1, (-0.5, -0.6), "TOO_CLOSE", 0.0),
+        (1, (0.0, 0.25), "BLOCKED", 0.0),
+        (1, (1.0000001, 0.0), "OUTSIDE", 0.0),
+        (1, np.array([0, -1]), "PLACED", 0.01),  # whole numbers are numbers
+    ):
+        _, paid, *_ = env.step({"choice": choice, "position": position})
+        assert (env.placement.name, paid) == (outcome, pytest.approx(reward))
 
 
 def touch_goal(env: CreateEnv) -> tuple:
     """Put the target beside the goal and act."""
     x, y, _ = env._goal.pose()
-    move_ball(env, env._target, x + 7.0, y + 2.0)
-    return env.step(NO_OP)
+    move_ball(env._target, x + 7.0, y + 2.0)
+    return env.step(WAIT)
 
 
-def test_goal_pays_ten_and_ends():
-    env = CreateEnv(task="collide")
-    env.reset(seed=0)
-    _, reward, terminated, truncated, info = touch_goal(env)
-    assert reward == pytest.approx(10.01) and terminated and not truncated
-    assert info["success"] == 1.0 and info["episode"] == {"r": pytest.approx(10.01), "l": 1}
+@pytest.mark.parametrize(
+    "task, paid, reward",
+    [("collide", True, 10.01), ("push", True, 11.01), ("push", False, 10.01)],
+)
+def test_goal_pays_ten_and_ends_and_in_push_the_target_hit_pays_with_it(task, paid, reward):
+    env = fixed_env(task, subgoal_reward=paid)
+    assert touch_goal(env)[1:] == (pytest.approx(reward), True, False, {"success": 1.0})
     with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(NO_OP)
+        env.step(WAIT)
 
 
-def test_target_hit_and_goal_in_one_action_both_count():
-    env = CreateEnv(task="push")
-    env.reset(seed=0)
-    _, reward, terminated, *_ = touch_goal(env)
-    assert reward == pytest.approx(11.01) and terminated
+@pytest.mark.parametrize("stays", [False, True])
+def test_a_goal_touched_before_the_required_hit_counts_only_if_it_is_touched_then(stays):
+    env = fixed_env("cannon")
+    x, y, _ = env._goal.pose()
+    move_ball(env._target, x, y)
+    env.step(WAIT)  # on the star, without a touch of the marker
+    assert not env._goal_hit and not env._target_hit
+    move_ball(env._target, *((x, y) if stays else (60.0, 56.0)))
+    move_ball(env._marker, env._target.body.position.x, env._target.body.position.y + 7.9)
+    _, reward, terminated, *_ = env.step(WAIT)
+    assert env._target_hit and terminated == stays
+    assert reward == pytest.approx(11.01 if stays else 1.01)
 
 
-@pytest.mark.parametrize("moved, hit", [(3.5, False), (3.6, True)])
-def test_target_counts_as_hit_from_3_56_units(moved, hit):
-    env = CreateEnv(task="push")
-    env.reset(seed=0)
-    env._start = (env._target.body.position.x - moved, env._start[1])
-    _, reward, *_ = env.step(NO_OP)
-    assert (reward > 1) == hit == env._target_hit
-
-
-def test_obstacle_wants_a_touch_of_the_marker_and_pays_two():
-    env = CreateEnv(task="obstacle")
-    env.reset(seed=0)
+def test_target_counts_as_hit_from_3_56_units_and_obstacle_wants_the_marker_and_pays_two():
+    for moved, reward in ((3.5, 0.01), (3.6, 1.01)):
+        env = fixed_env("push")
+        env._start = (env._target.body.position.x - moved, env._start[1])
+        assert env.step(WAIT)[1] == pytest.approx(reward)
+    env = fixed_env("obstacle")
     env._start = (0.0, 0.0)
-    assert env.step(NO_OP)[1] == pytest.approx(0.01)
+    assert env.step(WAIT)[1] == pytest.approx(0.01)
     env._marker.touched = True
-    assert env.step(NO_OP)[1] == pytest.approx(2.01)
-    assert env.step(NO_OP)[1] == pytest.approx(0.01)  # once
+    assert env.step(WAIT)[1] == pytest.approx(2.01)
+    assert env.step(WAIT)[1] == pytest.approx(0.01)  # once
 
 
 @pytest.mark.parametrize("paid, reward", [(True, 2.01), (False, 0.01)])
 def test_subgoal_pays_once_and_goes(paid, reward):
-    env = CreateEnv(task="seesaw", subgoal_reward=paid)
-    env.reset(seed=0)
+    env = fixed_env("seesaw", subgoal_reward=paid)
     subgoal = env._subgoals[0]
-    move_ball(env, env._target, subgoal.x, subgoal.y)
-    assert env.step(NO_OP)[1] == pytest.approx(reward)
-    assert not env._subgoals and subgoal not in env._things
-    move_ball(env, env._target, subgoal.x, subgoal.y)
-    assert env.step(NO_OP)[1] == pytest.approx(0.01)
+    for expected in (reward, 0.01):
+        move_ball(env._target, subgoal.x, subgoal.y)
+        assert env.step(WAIT)[1] == pytest.approx(expected)
+        assert not env._subgoals and subgoal not in env._things
 
 
-def test_tool_cost_is_taken_off_goal_and_subgoals():
-    env = fixed_env("seesaw", find_tool("Triangle", size=3), tool_cost=0.1)
-    env.step({"choice": 1, "position": (0.8, 0.3)})
-    assert len(env._centres) == 1
-    move_ball(env, env._target, env._subgoals[0].x, env._subgoals[0].y)
-    assert env.step(NO_OP)[1] == pytest.approx(0.01 + 1.9)
-    assert touch_goal(env)[1] == pytest.approx(0.01 + 9.9)
-
-
-def test_time_limit_truncates():
-    limits = {task: level.max_actions for task, level in c.TASKS.items()}
-    assert Counter(limits.values()) == {30: 9, 50: 2, 40: 1}
-    assert limits["obstacle"] == limits["belt"] == 50 and limits["basket"] == 40
-    env = CreateEnv(task="push")
+def test_time_limit_truncates_and_balls_that_leave_terminate():
+    env = fixed_env("push")
     env.task = dataclasses.replace(env.task, max_actions=2)
-    env.reset(seed=0)
-    assert env.step(NO_OP)[2:4] == (False, False)
-    assert env.step(NO_OP)[2:4] == (False, True)
-
-
-def test_balls_that_leave_end_the_episode():
-    env = CreateEnv(task="push")
-    env.reset(seed=0)
-    move_ball(env, env._marker, -1.0, 40.0)
-    assert env.step(NO_OP)[2] is True
+    assert env.step(WAIT)[2:4] == (False, False)
+    assert env.step(WAIT)[2:] == (False, True, {"success": 0.0})
+    env = fixed_env("push")
+    move_ball(env._marker, -1.0, 40.0)
+    assert env.step(WAIT)[2] is True
     env.reset(seed=0)
     env._target_hit = True  # then the marker does not matter any more
-    move_ball(env, env._marker, -1.0, 40.0)
-    assert env.step(NO_OP)[2] is False
-    move_ball(env, env._target, 40.0, -5.0)
-    assert env.step(NO_OP)[2] is True
+    move_ball(env._marker, -1.0, 40.0)
+    assert env.step(WAIT)[2] is False
+    move_ball(env._target, 40.0, -5.0)
+    assert env.step(WAIT)[2] is True
 
 
-# ---- the observation ----
+# ---- what the agent sees and may do ----
 
 
-def redraw(env: CreateEnv) -> np.ndarray:
-    """The slow obvious picture: every stroke over the whole canvas, nothing cached."""
-    xs, ys = c._pixel_grid(84)
-    canvas = np.full((84, 84), 255.0)
-    things = [t for t in env._things if t.body is None] + env._moving
-    for thing in things:
-        for grey, shape, numbers in c.grey_strokes(thing):
-            cover = np.clip(0.5 - c.signed_distance(shape, numbers, xs, ys), 0, 1)
-            canvas = canvas * (1 - cover) + grey * cover
-    return canvas
+def slow_picture(env: CreateEnv, fine: int = 5) -> np.ndarray:
+    """The obvious picture without Pillow: which of a pixel's 25 points are in which stroke?"""
+    at = (np.arange(84 * fine) + 0.5) / fine
+    points = at[None, :] + 1j * at[::-1, None]  # row 0 is the top
+    image = np.full(points.shape, 255.0)
+    for thing in sorted(env._things, key=lambda thing: thing.body is not None):
+        for corners, width, grey, _ in c.strokes(thing.tool, thing.pose()):
+            z = [complex(*corner) for corner in corners]
+            edges = list(zip(z, [*z[1:], z[0]], strict=True))
+            if width == 0:
+                inside = np.all([((points - a) / (b - a)).imag >= 0 for a, b in edges], axis=0)
+            else:
+                edges = edges[:-1] if width > 0 and len(z) > 1 else edges
+                along = [np.clip(((points - a) / (b - a or 1)).real, 0, 1) for a, b in edges]
+                near = [points - a - t * (b - a) for t, (a, b) in zip(along, edges, strict=True)]
+                inside = np.abs(near).min(axis=0) <= abs(width) / 2
+            image[inside] = image[inside] if grey is None else grey
+    return image.reshape(84, fine, 84, fine).mean(axis=(1, 3))
 
 
 @pytest.mark.parametrize("task", list(c.TASKS))
-def test_cached_picture_equals_a_full_redraw(task):
-    env = CreateEnv(range(c.NUM_ACTIONS), 50, task=task)
-    rng = np.random.default_rng(0)
+def test_picture_equals_the_slow_obvious_one(task):
+    env, rng = CreateEnv(range(c.NUM_ACTIONS), 50, task=task), np.random.default_rng(0)
     env.reset(seed=4)
-    for _ in range(25):
+    over, actions = False, 0
+    while not over and actions < 8:
         action = {"choice": int(rng.integers(50)), "position": rng.uniform(-1, 1, 2)}
         observation, _, terminated, truncated, _ = env.step(action)
-        # positions are rounded to an eighth of a pixel, so soft edges may differ by that share
-        assert np.abs(observation["state"][-1] - redraw(env)).max() <= 255 / 8 + 1
-        if terminated or truncated:
-            env.reset()
+        over, actions = terminated or truncated, actions + 1
+    error = np.abs(observation["state"][-1] - slow_picture(env))  # thin lines: a third of a unit
+    assert error.mean() < 2 and (error > 100).mean() < 0.004
 
 
-def test_frames_are_stacked_newest_last_after_black():
-    env = CreateEnv(task="push")
+def test_frames_are_stacked_newest_last_after_black_upright_and_not_mirrored():
+    env = CreateEnv(task="collide")
     first = env.reset(seed=0)[0]["state"]
     assert first.shape == (3, 84, 84) and first.dtype == np.uint8
     assert not first[:2].any() and first[2].max() == 255
-    second = env.step(NO_OP)[0]["state"]
+    assert env._target.x > 42  # to the right in the world and in the picture
+    for thing, grey in ((env._target, 138), (env._goal, 191)):
+        assert first[2][int(84 - thing.y), int(thing.x)] == grey
+    second = env.step(WAIT)[0]["state"]
     assert np.array_equal(second[1], first[2]) and not np.array_equal(second[2], second[1])
     assert not first[:2].any()  # earlier arrays are left alone
 
 
-def test_picture_is_upright_and_not_mirrored():
-    env = CreateEnv(task="collide")
-    picture = env.reset(seed=0)[0]["state"][-1]
-    for thing, grey in ((env._target, 138), (env._goal, 191)):
-        x, y, _ = thing.pose()
-        assert picture[int(84 - y), int(x)] == grey
-    assert env._target.x > 42  # to the right in the world and in the picture
-
-
-def test_every_class_has_its_own_look():
+@pytest.mark.parametrize("colour", [False, True])
+def test_every_class_has_its_own_look(colour):
     looks = set()
     for kind in KINDS[1:]:
-        canvas = np.full((84, 84), 255.0, np.float32)
-        thing = c.build(EXAMPLES[kind][0], 42, 42, pymunk.Space().static_body)
-        c.paint(canvas, c.grey_strokes(thing))
-        assert canvas.min() < 200, kind
-        looks.add(canvas.astype(np.uint8).tobytes())
+        marks = c.strokes(EXAMPLES[kind][0], (42.0, 42.0, 0.0))
+        picture = c.Canvas(84, colour).draw(marks).picture()
+        assert picture.min() < 200, kind
+        looks.add(picture.tobytes())
     assert len(looks) == len(KINDS) - 1
 
 
-# ---- the API ----
-
-
-@pytest.mark.parametrize("task", list(c.TASKS))
-def test_check_env_without_warnings(task):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(f"ActionGen/Create-{task.capitalize()}-v0")
-        check_env(env.unwrapped, skip_render_check=True)
-        assert env.unwrapped.task is c.TASKS[task]
-    assert gymnasium.make("ActionGen/Create-v0").unwrapped.task is c.TASKS["push"]
-
-
-def test_render_check_and_frames():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make("ActionGen/Create-Belt-v0", render_mode="rgb_array")
-        check_env(env.unwrapped)
-    env = fixed_env("push", find_tool("Cannon"), render_mode="rgb_array", render_size=210)
+def test_pictures_show_scene_and_state_side_by_side():
+    env = fixed_env("push", find_tool("Cannon"), render_mode="rgb_array", render_size=252)
     assert len(env.render_frames()) == 1
-    env.step({"choice": 1, "position": (-0.3, 0.6)})
+    state = env.step({"choice": 1, "position": (-0.3, 0.6)})[0]["state"]
     frames = env.render_frames()
-    assert len(frames) == c.FRAMES_PER_ACTION and np.array_equal(frames[-1], env.render())
-    assert frames[0].shape == (225, 210, 3) and frames[0].dtype == np.uint8
-    assert not np.array_equal(frames[0], frames[-1])
-    assert CreateEnv().render() is None
+    assert len(frames) == 5 and np.array_equal(frames[-1], env.render())
+    assert frames[0].shape == (270, 252 + 6 + 84, 3) and not np.array_equal(frames[0], frames[-1])
+    assert np.array_equal(frames[-1][:252, -84:, 0], state.reshape(252, 84))
 
 
-def random_action(rng, k: int) -> dict:
-    return {"choice": int(rng.integers(k)), "position": rng.uniform(-1, 1, 2).astype(np.float32)}
-
-
-def rollout(env: CreateEnv, seed: int, steps: int) -> list:
-    rng, log = np.random.default_rng(seed), [env.reset(seed=seed)[0]]
-    for _ in range(steps):
-        observation, reward, terminated, truncated, _ = env.step(random_action(rng, 50))
-        log.append((observation, reward, terminated, truncated))
-        if terminated or truncated:
-            log.append(env.reset()[0])
-    return log
-
-
-@pytest.mark.parametrize("task", ["push", "seesaw", "obstacle"])
-def test_one_seed_one_run(task):
-    a, b = (rollout(CreateEnv(task=task), 7, 60) for _ in range(2))
-    np.testing.assert_equal(a, b)
-    watched = rollout(CreateEnv(task=task, render_mode="rgb_array"), 7, 60)
-    np.testing.assert_equal(a, watched)  # watching changes nothing
-
-
-def test_available_sets():
-    pool = c.split_actions()["test"]
+@pytest.mark.parametrize("part", ["train", "valid", "test"])
+def test_the_no_op_and_k_minus_1_tools_are_on_offer_in_every_pool(part):
+    pool = c.split_actions()[part]
     env, seen = CreateEnv(pool, 50), set()
-    for seed in range(30):
+    for seed in range(60):
         available = env.reset(seed=seed)[0]["available"]
-        assert available[0] == 0 and len(set(available)) == 50 and available.dtype == np.int64
-        assert set(available) <= set(pool)
+        assert available[0] == c.NO_OP and available.dtype == np.int64
+        assert len(set(available)) == 50 and set(available[1:]) <= set(pool)
         seen |= set(available)
     assert len(seen) > 0.9 * len(pool)
-    everything = CreateEnv(pool[::-1], len(pool)).reset(seed=1)[0]["available"]
-    assert np.array_equal(everything, pool)  # the no-op, then sorted
-    without = CreateEnv(c.split_actions()["valid"], 20).reset(seed=1)[0]["available"]
-    assert without[0] == 0 and 0 not in without[1:]
+    whole = CreateEnv(pool[::-1], len(pool) + 1)  # nothing to draw: sorted
+    assert whole.reset(seed=1)[0]["available"].tolist() == [0, *pool]
+    assert np.array_equal(CreateEnv([0, *pool], len(pool) + 1).action_pool, pool)
+    with pytest.raises(ValueError, match=f"from 1 to {len(pool) + 1}"):
+        CreateEnv(pool, len(pool) + 2)
 
 
-def vector_rollout(async_envs: bool, steps: int = 40) -> tuple:
-    envs = c.make_vec(3, None, 50, seed=11, task="push", async_envs=async_envs)
-    assert envs.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.SAME_STEP
-    rng, log = np.random.default_rng(0), [envs.reset()[0]]
-    ended = []
-    for _ in range(steps):
-        action = {"choice": rng.integers(50, size=3), "position": rng.uniform(-1, 1, (3, 2))}
-        action["position"] = action["position"].astype(np.float32)
-        observation, reward, terminated, truncated, info = envs.step(action)
-        log.append((observation, reward, terminated, truncated))
-        if (terminated | truncated).any():
-            ended.append((terminated | truncated, info))
-    envs.close()
-    return log, ended
-
-
-def test_vector_envs_agree_with_each_other_and_with_single_envs():
-    (sync, ended), (parallel, _) = vector_rollout(False), vector_rollout(True)
-    np.testing.assert_equal(sync, parallel)
-    singles = [CreateEnv() for _ in range(3)]
-    for i, env in enumerate(singles):
-        first = env.reset(seed=11 + i)[0]
-        np.testing.assert_equal(first, {key: value[i] for key, value in sync[0].items()})
-    rng = np.random.default_rng(0)
-    for observation, reward, *_ in sync[1:]:
-        choices, positions = rng.integers(50, size=3), rng.uniform(-1, 1, (3, 2))
-        for i, env in enumerate(singles):
-            position = positions[i].astype(np.float32)
-            single = env.step({"choice": choices[i], "position": position})
-            now = env.reset()[0] if single[2] or single[3] else single[0]
-            np.testing.assert_equal(now, {key: value[i] for key, value in observation.items()})
-            assert reward[i] == single[1]
-    over, info = ended[0]
-    assert np.array_equal(info["_final_info"], over) and np.array_equal(info["_final_obs"], over)
-    assert np.array_equal(info["final_info"]["_success"], over)
-    assert (info["final_info"]["episode"]["l"][over] > 0).all()
-
-
-def test_vector_reset_with_a_seed_reseeds():
-    envs = c.make_vec(2, None, 50, seed=1, async_envs=False)
-    first = envs.reset(seed=5)[0]
-    envs.reset()
-    np.testing.assert_equal(envs.reset(seed=5)[0], first)
-
-
-BAD_ARGUMENTS = [
-    ({"task": "pull"}, "unknown task 'pull'"),
-    ({"task": ["push"]}, r"unknown task \['push'\]"),
-    ({"subgoal_reward": "no"}, "subgoal_reward must be True or False, got 'no'"),
-    ({"action_pool": [0, 1, 2], "num_available": 4}, "num_available must be an integer in 1..3"),
-    ({"action_pool": [1, 2], "num_available": 4}, "num_available must be an integer in 1..3"),
-    ({"num_available": 0}, "num_available must be"),
-    ({"num_available": 1.5}, "num_available must be an integer .* got 1.5"),
-    ({"action_pool": [0, 1, c.NUM_ACTIONS], "num_available": 2}, "ids must be 0.."),
-    ({"action_pool": [-1, 1, 2], "num_available": 2}, "ids must be 0.."),
-    ({"action_pool": [1, 1, 2], "num_available": 2}, "1 repeated"),
-    ({"action_pool": [0.5, 1.5], "num_available": 2}, "integer ids"),
-    ({"render_mode": "human"}, "unknown render_mode"),
-    ({"tool_cost": float("nan")}, "tool_cost"),
-    ({"render_size": 10}, "render_size"),
-]
-
-
-@pytest.mark.parametrize("arguments, message", BAD_ARGUMENTS)
-def test_bad_arguments(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        CreateEnv(**arguments)
-    with pytest.raises(ValueError, match=message):
-        c.make_vec(2, **{"seed": 0, "async_envs": True, **arguments})
-
-
-@pytest.mark.parametrize("num_envs, seed", [(0, 0), (1.5, 0), ("2", 0), (2, -1), (2, None)])
-def test_bad_numbers_of_environments_and_seeds(num_envs, seed):
-    with pytest.raises(ValueError, match="must be a whole number"):
-        c.make_vec(num_envs, seed=seed)
-
-
-BAD_ACTIONS = [
-    {"choice": 50, "position": (0, 0)},
-    {"choice": -1, "position": (0, 0)},
-    {"choice": 1.0, "position": (0, 0)},
-    {"choice": "1", "position": (0, 0)},
-    {"choice": 1, "position": (float("nan"), 0)},
-    {"choice": 1, "position": (0, float("inf"))},
-    {"choice": 1, "position": (0, 0, 0)},
-    {"choice": 1, "position": ("0.1", "0.2")},
-    {"choice": 1, "position": (None, 0.5)},
-    {"choice": 1, "position": (1j, 0.5)},
-    {"choice": 1, "position": 0.5},
-    {"choice": 1},
-    {},
-    3,
-    None,
-]
-
-
-def test_bad_actions_change_nothing():
+def test_bad_arguments_and_actions_change_nothing():
     env, clean = CreateEnv(), CreateEnv()
     env.reset(seed=0), clean.reset(seed=0)
-    for action in BAD_ACTIONS:
+    bad = [(choice, (0, 0)) for choice in (50, -1, 1.0)]
+    bad += [(1, position) for position in ((math.nan, 0), (0, math.inf), (0, 0, 0), 0.5)]
+    for choice, position in bad:
         with pytest.raises(ValueError, match="choice|position"):
-            env.step(action)
-    np.testing.assert_equal(env.step(NO_OP), clean.step(NO_OP))
+            env.step({"choice": choice, "position": position})
+    np.testing.assert_equal(env.step(WAIT), clean.step(WAIT))
+    for arguments in ({"task": "pull"}, {"render_mode": "human"}):
+        with pytest.raises(ValueError, match="unknown"):
+            CreateEnv(**arguments)
     with pytest.raises(gymnasium.error.ResetNeeded):
-        CreateEnv().step(NO_OP)
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        CreateEnv(render_mode="rgb_array").render()
+        CreateEnv().step(WAIT)
 
 
-def test_a_pool_without_the_no_op_can_be_offered_whole():
-    obs, _ = CreateEnv(action_pool=[5, 3], num_available=3).reset(seed=0)
-    assert obs["available"].tolist() == [0, 3, 5]
-
-
-def check_scene(env: CreateEnv) -> None:
-    """No lost or leaked bodies, no NaN."""
-    space, things = env._space, env._things
-    assert {id(shape) for shape in space.shapes} == {id(thing.shape) for thing in things}
-    parts = [part for thing in things for part in thing.parts]
-    assert len(space.bodies) == sum(isinstance(part, pymunk.Body) for part in parts)
-    assert len(space.constraints) == sum(isinstance(part, pymunk.Constraint) for part in parts)
-    for thing in env._moving:
-        assert all(map(math.isfinite, thing.pose()))
-
-
-def soak(steps_per_task: int) -> Counter:
-    """Random play with every tool class (uniform over classes); returns placements by class."""
+# pytest turns what a contact rule raises into a warning
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+def test_five_thousand_random_steps():
     rng, placed = np.random.default_rng(1), Counter()
     for task in c.TASKS:
-        env = CreateEnv(range(c.NUM_ACTIONS), 50, task=task)
+        env = CreateEnv(task=task)
         env.reset(seed=1)
-        for _ in range(steps_per_task):
-            tools = EXAMPLES[KINDS[rng.integers(len(KINDS))]]
+        for _ in range(5000 // len(c.TASKS)):
+            tools = EXAMPLES[KINDS[rng.integers(len(KINDS))]]  # uniform over classes
             tool = tools[rng.integers(len(tools))]
-            env._available[1] = c.TOOLS.index(tool)
-            position = rng.uniform(-1.02, 1.02, 2)
-            observation, reward, terminated, truncated, info = env.step(
-                {"choice": 1, "position": position}
-            )
+            env.available[1] = c.TOOLS.index(tool)
+            action = {"choice": 1, "position": rng.uniform(-1.02, 1.02, 2)}
+            observation, reward, terminated, truncated, _ = env.step(action)
             assert math.isfinite(reward) and observation["state"][-1].std() > 0
-            placed[tool.kind] += info["placement"] == Placement.PLACED
-            if terminated or truncated:
-                check_scene(env)
+            placed[tool.kind] += env.placement == Placement.PLACED
+            if terminated or truncated:  # no lost or leaked parts, no NaN
+                space, parts = env._space, sum(len(thing.parts) for thing in env._things)
+                assert len(space.bodies) + len(space.constraints) + len(space.shapes) == parts
+                assert np.isfinite([thing.pose() for thing in env._things]).all()
                 env.reset()
-    return placed
-
-
-def test_five_thousand_random_steps(capfd):
-    placed = soak(5000 // len(c.TASKS) + 1)
     assert all(placed[kind] > 20 for kind in KINDS[1:]), placed
-    assert capfd.readouterr().err == ""  # pymunk prints what a callback raises
-
-
-@pytest.mark.slow
-def test_a_hundred_thousand_random_steps(capfd):
-    resource = pytest.importorskip("resource")
-    soak(500)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    soak(100_000 // len(c.TASKS) + 1)
-    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    assert grown < 60_000, f"memory grew by {grown} kB"
-    assert capfd.readouterr().err == ""
 
 
 # Published environment: success in % of 2,000 random episodes, mean length of 200 no-op episodes.
+# fmt: off
 PUBLISHED = {
-    "push": (1.6, 7.2),
-    "navigate": (0.1, 12.0),
-    "obstacle": (0.0, 40.1),
-    "seesaw": (0.15, 8.5),
-    "belt": (0.0, 30.0),
-    "buckets": (0.6, 7.0),
-    "cannon": (0.35, 7.0),
-    "collide": (0.75, 7.0),
-    "moving": (2.5, 7.0),
-    "ladder": (0.3, 7.0),
-    "basket": (0.65, 7.0),
-    "funnel": (1.9, 13.0),
+    "push": (1.6, 7.2), "navigate": (0.1, 12.0), "obstacle": (0.0, 40.1), "seesaw": (0.15, 8.5),
+    "belt": (0.0, 30.0), "buckets": (0.6, 7.0), "cannon": (0.35, 7.0), "collide": (0.75, 7.0),
+    "moving": (2.5, 7.0), "ladder": (0.3, 7.0), "basket": (0.65, 7.0), "funnel": (1.9, 13.0),
 }
+# fmt: on
 
 
-def random_success(task: str, episodes: int) -> float:
+@pytest.mark.parametrize(
+    "task, episodes",
+    [("push", 200), ("moving", 200)]
+    + [pytest.param(task, 2000, marks=pytest.mark.slow) for task in c.TASKS],
+)
+def test_random_success_and_no_op_length_as_published(task, episodes):
     env, rng, hits = CreateEnv(task=task), np.random.default_rng(2), 0.0
     env.reset(seed=2)
     for _ in range(episodes):
         over = False
         while not over:
-            *_, terminated, truncated, info = env.step(random_action(rng, 50))
+            action = {"choice": int(rng.integers(50)), "position": rng.uniform(-1, 1, 2)}
+            *_, terminated, truncated, info = env.step(action)
             over = terminated or truncated
         hits += info["success"]
         env.reset()
-    return hits / episodes
-
-
-def assert_same_rate(ours: float, n: int, published: float, m: int) -> None:
-    """Two shares of n and m episodes differ by no more than 3.5 standard errors."""
-    pooled = (ours * n + published * m + 1) / (n + m + 2)
-    error = math.sqrt(pooled * (1 - pooled) * (1 / n + 1 / m))
-    assert abs(ours - published) <= 3.5 * error, (ours, published, error)
-
-
-@pytest.mark.parametrize("task", ["push", "moving"])
-def test_random_success_is_near_the_published_one(task):
-    assert_same_rate(random_success(task, 300), 300, PUBLISHED[task][0] / 100, 2000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", list(c.TASKS))
-def test_random_success_and_no_op_length_as_published(task):
-    assert_same_rate(random_success(task, 2000), 2000, PUBLISHED[task][0] / 100, 2000)
-    lengths = [play_no_op(task, seed)["episode"]["l"] for seed in range(200)]
-    error = np.std(lengths) * math.sqrt(2 / 200)
+    success, length = PUBLISHED[task]
+    pooled = (hits + success * 20 + 1) / (episodes + 2002)  # published: 2,000 episodes
+    error = math.sqrt(pooled * (1 - pooled) * (1 / episodes + 1 / 2000))
+    assert abs(hits / episodes - success / 100) <= 3.5 * error, (hits / episodes, success, error)
+    lengths = [play_no_op(task, seed)[0] for seed in range(episodes // 10)]
     # belt: published episodes have one action more before the limit, in 41 % of them
-    slack = 0.05 + (0.41 if task == "belt" else 0.0)
-    assert abs(np.mean(lengths) - PUBLISHED[task][1]) <= 3.5 * error + slack
+    slack = 0.05 + 0.41 * (task == "belt")
+    slack += 3.5 * np.std(lengths) * math.sqrt(1 / len(lengths) + 1 / 200)
+    assert abs(np.mean(lengths) - length) <= slack
 
 
 # ---- the probe ball ----
@@ -1065,34 +650,27 @@ def test_random_success_and_no_op_length_as_published(task):
 def launch_alone(tool: Tool, place, start, velocity) -> tuple[np.ndarray, int]:
     """The slow obvious launch: one scene, contact by a query after every step."""
     space, thing, ball = drop(tool, c.to_units(start), tuple(velocity), c.to_units(place))
-    contact, states = c.PROBE_STEPS + 1, []
+    contact, places = c.PROBE_STEPS + 1, []
     for step in range(1, c.PROBE_STEPS + 1):
         space.step(c.DT)
-        if thing.first_contact is not None or thing.touched:
-            raise AssertionError("only used by the game")
         touching = any(hit.shape is thing.shape for hit in space.shape_query(ball.shape))
-        if touching and contact > step:
-            contact = step
-        if step % c.PROBE_EVERY == 0:
-            states.append([*ball.body.position, *ball.body.velocity])
-    return np.array(states), contact
+        contact = min(contact, step) if touching else contact
+        places += [tuple(ball.body.position)] if step % c.PROBE_EVERY == 0 else []
+    return np.array(places), contact
 
 
-@pytest.mark.parametrize("kind", KINDS[1:])
+@pytest.mark.parametrize("kind", KINDS)
 def test_launches_side_by_side_equal_launches_alone(kind):
     rng = np.random.default_rng(3)
     tool = EXAMPLES[kind][rng.integers(len(EXAMPLES[kind]))]
-    places, start = rng.uniform(-0.7, 0.7, (16, 2)), rng.uniform(-1, 1, (16, 2))
+    places, start = rng.uniform(-0.7, 0.7, (12, 2)), rng.uniform(-1, 1, (12, 2))
     velocity = 25 * (places - start) / np.linalg.norm(places - start, axis=1, keepdims=True)
     states, contact = c._launch(tool, places, start, velocity)
     tolerance = 2.0 if kind == "See-saw" else 1e-4  # starts on its joint limit: rounding grows
     agree = 0
-    for i in range(16):
+    for i in np.flatnonzero(contact):  # but for overlaps at launch
         alone, alone_contact = launch_alone(tool, places[i], start[i], velocity[i])
-        if contact[i] == 0:
-            continue  # overlap at launch
-        where = c.to_units(states[i, :, 2:4])
-        assert np.abs(where - alone[:, :2]).max() < tolerance
+        assert np.abs(c.to_units(states[i, :, 2:4]) - alone).max() < tolerance
         agree += abs(int(contact[i]) - alone_contact) <= 1
     # the query sees a teleported or held ball where it is now, the callback where it was
     assert agree >= (contact > 0).sum() - (4 if kind in ("Cannon", "Funnel", "Bucket") else 1)
@@ -1100,8 +678,7 @@ def test_launches_side_by_side_equal_launches_alone(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_probe_trajectories_meet_the_tool(kind):
-    action = c.TOOLS.index(EXAMPLES[kind][-1])
-    states = c.action_observations([action], 64, "state", cache=None)[0]
+    states = c.action_observations([c.TOOLS.index(EXAMPLES[kind][-1])], 64, "state")[0]
     assert states.shape == (64, 7, 6) and states.dtype == np.float32 and np.isfinite(states).all()
     assert (np.abs(states[:, 0, :2]) <= 0.7).all()
     assert np.array_equal(states[..., :2], np.repeat(states[:, :1, :2], 7, axis=1))
@@ -1110,156 +687,94 @@ def test_probe_trajectories_meet_the_tool(kind):
     assert (distance.min(axis=1) < 0.75).mean() > 0.95
 
 
-def test_every_ramp_launch_hits():
-    rng = np.random.default_rng(0)
-    tool = EXAMPLES["Ramp"][-1]
-    places, start = rng.uniform(-0.7, 0.7, (200, 2)), rng.uniform(-1, 1, (200, 2))
-    gap = places - start
-    _, contact = c._launch(tool, places, start, 0.9 * c.WORLD / 2 * gap)
-    assert (contact <= c.PROBE_STEPS).mean() > 0.9  # a first attempt, slow ones fall short
-    states = c.action_observations([c.TOOLS.index(tool)], 200, "state", cache=None)[0]
-    distance = np.linalg.norm(states[..., 2:4] - states[..., :2], axis=-1)
-    assert (distance.min(axis=1) * 42 < 22 / 2 + 5 + 6).all()  # contact between two frames
-
-
-def test_observation_bytes_depend_on_seed_tool_and_number_only(tmp_path):
+def test_observation_bytes_depend_on_seed_tool_and_number_only(capfd):
     ids = [5, 1500, 900, 2050]
-    all_at_once = c.action_observations(ids, 12, seed=4, workers=2, cache=None)
-    assert all_at_once.shape == (4, 12, 7, 2)
-    for row, action in enumerate(ids):
-        alone = c.action_observations([action], 12, seed=4, cache=None)
-        assert np.array_equal(alone[0], all_at_once[row])
-    assert not np.array_equal(c.action_observations([5], 12, seed=5, cache=None)[0], all_at_once[0])
-    full = c.action_observations(ids, 12, "state", seed=4, cache=None)
-    assert np.array_equal(full[..., 2:4], all_at_once)
-    assert c.action_observations([], 12, cache=None).shape == (0, 12, 7, 2)
+    for modality in c.MODALITIES:
+        both = c.action_observations(ids, 3, modality, seed=4, workers=2)
+        for row, action in enumerate(ids):
+            assert np.array_equal(c.action_observations([action], 3, modality, 4)[0], both[row])
+    states = c.action_observations(ids, 3, "state", seed=4)
+    assert np.array_equal(states[..., 2:4], c.action_observations(ids, 3, seed=4))
+    assert not np.array_equal(c.action_observations(ids, 3, seed=5), states[..., 2:4])
+    assert capfd.readouterr().err == ""  # no bar where nobody watches
+    for arguments in (([-1], 4), ([0.5], 4), ([1], 0), ([1], 4, "sound")):
+        with pytest.raises(ValueError):
+            c.action_observations(*arguments)
 
 
-def test_cache_gives_the_same_bytes_and_grows(tmp_path, monkeypatch):
-    monkeypatch.setattr(c, "CACHE_FROM", 1)
-    first = c.action_observations([3, 8], 10, cache=tmp_path)
-    (path,) = tmp_path.glob("*.npz")
-    both = c.action_observations([8, 20], 10, cache=tmp_path)
-    assert list(tmp_path.iterdir()) == [path]
-    with np.load(path, allow_pickle=False) as stored:
-        assert stored["ids"].tolist() == [3, 8, 20]
-    assert np.array_equal(both[0], first[1])
-    work = c._probe_states
-
-    def signature_only(job):
-        assert job[1:] == (4, 0), "found again, not computed again"
-        return work(job)
-
-    monkeypatch.setattr(c, "_probe_states", signature_only)
-    assert np.array_equal(c.action_observations([20, 3], 10, cache=tmp_path)[1], first[0])
-    monkeypatch.setitem(c.FIRST_CORNER, "Funnel", 90)  # other physics: nothing to be found
-    with pytest.raises(AssertionError, match="not computed again"):
-        c.action_observations([20, 3], 10, cache=tmp_path)
-
-
-@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut off"])
-def test_damaged_cache_is_made_again(tmp_path, monkeypatch, capsys, damage):
-    monkeypatch.setattr(c, "CACHE_FROM", 1)
-    first = c.action_observations([3], 10, cache=tmp_path)
-    (path,) = tmp_path.glob("*.npz")
-    path.write_bytes(damage)
-    again = c.action_observations([3], np.int64(10), cache=tmp_path)  # the same file
-    assert np.array_equal(first, again) and list(tmp_path.iterdir()) == [path]
-    assert f"{path} is damaged" in capsys.readouterr().out
-    assert np.load(path, allow_pickle=False)["ids"].tolist() == [3]
-
-
-def test_probe_video():
+def test_videos_show_the_scenes_of_the_states():
     ids = [find_tool("Ball", size=9), find_tool("See-saw"), 0]
-    states = c.action_observations(ids, 3, "state", cache=None)
-    video = c.action_observations(ids, 3, "video", workers=2, cache=None)
-    assert video.shape == (3, 3, 7, 48, 48) and video.dtype == np.uint8
+    states, video = (c.action_observations(ids, 8, kind) for kind in ("state", "video"))
+    assert video.shape == (3, 8, 7, 48, 48) and video.dtype == np.uint8
     for frame, state in zip(video[0].reshape(-1, 48, 48), states[0].reshape(-1, 6), strict=True):
-        x, y = (state[2:4] - state[:2]) * 24 + 24  # the camera stands over the tool
-        if 1 < x < 47 and 1 < y < 47:
-            assert frame[int(48 - y), int(x)] == 163  # the ball
-    assert (video[2].reshape(21, -1).min(axis=1) >= 163).all()  # the no-op has no picture
+        for x, y in (state[:2], state[2:4]):  # the tool's grey is 159, that of the ball over it 163
+            column, row = int(x * 24 + 24), int(24 - y * 24)
+            if 0 <= column < 48 and 0 <= row < 48:
+                assert 159 <= frame[row, column] <= 163
+    assert (video[2].reshape(56, -1).min(axis=1) >= 163).all()  # the no-op has no picture
+
+
+# ---- playing and the command ----
+
+
+def test_play_follows_mouse_and_keys_without_a_display(monkeypatch):
+    pytest.importorskip("matplotlib").use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.backend_bases import KeyEvent, MouseEvent
+
+    env = CreateEnv([5, 900, 1500], 3, "rgb_array", "push")
+
+    def events() -> None:
+        figure = plt.gcf()
+        strip, scene = figure.axes
+
+        def send(axes=None, x=0, y=0) -> tuple[int, str]:
+            """A click, or a press of the space bar; how far the episode is then."""
+            x, y = scene.transData.transform((x, y)) if axes is scene else (x, y)
+            x, y = strip.transData.transform((x, y)) if axes is strip else (x, y)
+            event = MouseEvent("button_press_event", figure.canvas, x, y, 1)
+            event = event if axes else KeyEvent("key_press_event", figure.canvas, " ")
+            figure.canvas.callbacks.process(event.name, event)
+            return env._actions, env.placement.name
+
+        figure.canvas.draw()
+        assert send(scene, 30, 50) == (1, "WAITED")  # the no-op is chosen at first
+        assert send(strip, 2.5, 0.5) == (1, "WAITED")
+        assert strip.get_title() == c.TOOLS[env.available[2]].kind
+        assert send(scene, 30, 50) == (2, "PLACED")
+        assert env._centres == [pytest.approx([30 / 42 - 1, 50 / 42 - 1])]
+        assert send(scene, 100, 50) == (2, "PLACED")  # on what the policy sees: nothing happens
+        assert send() == (3, "WAITED")
+        env._actions = 29
+        assert send() == (0, "WAITED") and not env._over  # the next episode
+
+    monkeypatch.setattr(plt, "show", events)
+    c.play(env)
+    plt.close("all")
+
+
+def test_random_episodes_offer_what_the_environment_offers():
+    frames, total = c.play_episode(CreateEnv([3, 4], 2, "rgb_array", render_size=84), seed=0)
+    assert len(frames) > 5 and c.play_episode(CreateEnv([3, 4], 2), seed=0) == ([], total)
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "arguments, files",
     [
-        ([c.NUM_ACTIONS], 4, "xy"),
-        ([-1], 4, "xy"),
-        ([0.5], 4, "xy"),
-        ([1], 0, "xy"),
-        ([1], 4, "sound"),
-        ([1], 4, "xy", 0, 0),
-        ([1], 4, "xy", -1),
+        ("--tries 3 --task moving", {"create_moving.gif"}),
+        ("--all-tasks --show-tools", {"create_tasks.png", "create_tools.png"}),
+        ("--show-probe bucket", {"create_probe.png"}),
+        ("--task pull", None),
+        ("--show-probe Spoon", None),
     ],
 )
-def test_bad_observation_requests(arguments):
-    with pytest.raises(ValueError):
-        c.action_observations(*arguments, cache=None)
-
-
-def test_bad_splits():
-    with pytest.raises(ValueError, match="unknown split 'half'"):
-        c.split_actions("half")
-    for seed in (-1, 1.5, None):
-        with pytest.raises(ValueError, match="seed"):
-            c.split_actions("default", seed)
-
-
-def test_angle_gaps_of_ids_that_do_not_exist():
-    with pytest.raises(ValueError, match="ids must be 0.."):
-        c.angle_gaps([-1], [0, 5])
-    with pytest.raises(ValueError, match="ids must be 0.."):
-        c.angle_gaps([1], [c.NUM_ACTIONS])
-
-
-# ---- the command ----
-
-
-def test_gif_shows_every_frame(tmp_path):
-    env = CreateEnv(render_mode="rgb_array", render_size=84)
-    env.reset(seed=0)
-    frames = env.render_frames()
-    env.step(NO_OP)
-    frames += env.render_frames()
-    c.save_gif(tmp_path / "new" / "episode.gif", frames, 10)
-    (path,) = (tmp_path / "new").iterdir()
-    with Image.open(path) as gif:
-        assert gif.n_frames == len(frames) == 1 + c.FRAMES_PER_ACTION
-        assert gif.size == (84, 90) and gif.info["duration"] == 100
-
-
-def run_command(*arguments: str) -> subprocess.CompletedProcess:
-    script = Path(c.__file__)
-    return subprocess.run(
-        [sys.executable, str(script), *arguments], capture_output=True, text=True, timeout=120
-    )
-
-
-def test_command_plays_an_episode(tmp_path):
-    done = run_command("--tries", "3", "--task", "moving", "--out", str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "create_moving.gif").stat().st_size > 10_000
-    assert "2,111 tools" in done.stdout and "train 1,098, valid 507, test 507" in done.stdout
-
-
-def test_command_draws_sheets(tmp_path):
-    done = run_command(
-        "--all-tasks", "--show-tools", "--show-probe", "Bucket", "--out", str(tmp_path)
-    )
-    assert done.returncode == 0, done.stderr
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"create_tasks.png", "create_tools.png", "create_probe.png"}
-
-
-@pytest.mark.parametrize("arguments", [("--task", "pull"), ("--show-probe", "Spoon")])
-def test_command_says_what_is_wrong(arguments, tmp_path):
-    done = run_command(*arguments, "--out", str(tmp_path))
-    assert done.returncode == 1 and done.stderr.startswith("error: unknown")
-    assert len(done.stderr.strip().splitlines()) == 1
-
-
-def test_environment_file_does_not_import_torch():
-    code = "import sys, create_env; assert 'torch' not in sys.modules"
-    folder = Path(c.__file__).parent
-    assert subprocess.run([sys.executable, "-c", code], cwd=folder, timeout=60).returncode == 0
+def test_command_draws_or_says_in_a_line_what_is_wrong(arguments, files, tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "module://no_such_backend")  # an inherited one ends nothing
+    command = [sys.executable, SCRIPT, *arguments.split(), "--out", tmp_path / "new"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if files is None:
+        assert done.returncode == 1 and done.stderr.startswith("error: unknown")
+        assert len(done.stderr.strip().splitlines()) == 1
+    else:
+        assert done.returncode == 0, done.stderr
+        assert {path.name for path in (tmp_path / "new").iterdir()} == files
