@@ -93,10 +93,12 @@ def check_05():
         return rows, ppo.load(folder / "best.pt")["agent"]
 
     new.finish = old.finish = lambda folder, *_: folder  # no test, no pictures
-    losses = [float(row["outcome_loss"]) for row in train(new, outcome_coef=0.5)[0]]
+    rows, _ = train(new, outcome_coef=0.5)
+    losses = [float(row["outcome_loss"]) for row in rows]
     assert np.mean(losses[-3:]) < 0.8 * losses[0], losses
-    weights, before = train(new, outcome_coef=0.0)[1], train(old)[1]
+    (_, weights), (rows_before, before) = train(new, outcome_coef=0.0), train(old)
     assert all(torch.equal(weights[name], before[name]) for name in before)
+    assert rows[0]["episode_return"] == rows_before[0]["episode_return"]  # the same first rollout
 
 
 def check_06():
@@ -149,6 +151,10 @@ def check_09():
         assert pi[padded < 0].eq(0).all()
         batch = rollout_and_ratios(agent, envs)
         assert batch["available"].min() == -1 and batch["taken"].min() >= 0
+    env = gridworld.GridWorldEnv([682, 1023], 2, once=True)  # LLLLL, UUUUU: it stays where it is
+    for _ in range(2):  # nor does a reset find the skills used up
+        env.reset()
+        assert [env.step(slot)[3] for slot in (0, 1)] == [False, True]  # truncated: nothing left
 
 
 if __name__ == "__main__":
