@@ -24,6 +24,7 @@ import tyro
 
 os.environ["MPLBACKEND"] = "agg"  # an inherited one may not exist here, and ends the import
 sys.path.insert(0, str(Path(__file__).parent))
+import matplotlib  # noqa: E402
 import paper  # noqa: E402
 from paper import ROOT, TABLE, hvae, ppo_actiongen, read  # noqa: E402
 
@@ -78,6 +79,8 @@ for file, key in (("results", "env task method phase"), ("analyses", "analysis t
     for row in read(ROOT / f"results/published_{file}.csv"):
         PUBLISHED[tuple(row[k] for k in key.split())] = float(row["mean"]), float(row["std"])
 RESULTS = ROOT / "results"
+LOOK = {"font.size": 8, "axes.titlesize": 8.5, "axes.titlelocation": "left"}
+LOOK |= {"axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.6}
 
 Place = tuple[str, str, int]  # env, task ("" without one), number of steps
 Cells = dict[tuple[Place, str], dict[str, list[float]]]  # place, method -> phase -> its seeds
@@ -176,12 +179,8 @@ def table(figure: str, cells: Cells) -> str:
 
 def canvas(count: int, columns: int, width: float, height: float, **options):
     """A figure with `count` panels of this size in inches, and its panels."""
-    import matplotlib
     from matplotlib.figure import Figure  # not pyplot, which would look for a screen
 
-    look = {"font.size": 8, "axes.titlesize": 8.5, "axes.titlelocation": "left"}
-    look |= {"axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.6}
-    matplotlib.rcParams.update(look | {"xtick.major.width": 0.6, "ytick.major.width": 0.6})
     columns = min(columns, count)
     lines = -(-count // columns)
     figure = Figure((width * columns, height * lines + 0.3), layout="constrained")
@@ -301,7 +300,8 @@ def section(name: str, draw: bool) -> str:
         text, drawn = table(name, some), cells and name not in ("main", "quick")
         picture = partial(draw_bars, path, cells) if drawn else None
     if draw and picture:
-        picture()
+        with matplotlib.rc_context(LOOK):
+            picture()
     pictures = [path, *sorted(RESULTS.glob(f"{name}-tsne-*.png"))]
     images = [f"![{p.stem}]({{folder}}{p.name})" for p in pictures if p.exists()]
     return "\n\n".join(filter(None, [text, *notes, *images])) + "\n"
