@@ -5,16 +5,16 @@ and of that action's representation c_i (hvae.py), and takes a softmax over the 
 
     pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
 
-So actions it was never trained on are simply another list of vectors. Three regularisers make that
-work: a random subset of the training actions in every episode, an entropy bonus, and selection of
-the model on held-out *validation* actions. The test actions are used once, at the end.
+So actions it was never trained on are simply another list of vectors. Three things make that work:
+a random subset of the training actions in every episode, an entropy bonus, and model selection on
+held-out *validation* actions. The test actions are used once, at the end.
 
     python ppo_actiongen.py gridworld --quick         # the whole protocol in minutes
-    python ppo_actiongen.py gridworld                 # our recipe (also: recsys, create, stacking)
+    python ppo_actiongen.py gridworld                 # or: recsys, create, stacking
     python ppo_actiongen.py gridworld --recipe paper  # Tables 3 and 4 to the letter
     python ppo_actiongen.py gridworld --method nearest-neighbor | --ent-coef 0 | --no-subsample
-    python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0  # C.2: learn the unseen
-    python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --num-available 20 --gif episode.gif
+    python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0     # C.2
+    python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --num-available 20
     torchrun --nproc_per_node=2 ppo_actiongen.py create
 
 Paper map, in the order of this file: Tables 3, 4 -> Args, TABLE_3 (ours: FAST, QUICK); D.3.2 state
@@ -46,6 +46,7 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 import torch.distributed as dist
+import torch.distributed.nn  # else Adam does, too late, and gloo's threads outlive the end
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
@@ -56,7 +57,6 @@ from torch.distributions import Beta, Categorical, Distribution, Normal
 import hvae
 
 Distribution.set_default_validate_args(False)  # the checks cost as much as the draws
-# Set by torchrun; without it one process does everything.
 RANK, WORLD_SIZE = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
 
 # ---- Tables 3 and 4: the hyper-parameters ----
@@ -67,52 +67,50 @@ AUX_ENT_SCALE = 0.1  # Table 3 "continuous entropy scaling", D.3.2
 class Args:
     """Train on training actions, select on validation actions, test on unseen ones."""
 
-    env: Annotated[str, tyro.conf.Positional] = "gridworld"  # gridworld, recsys, create, stacking
-    method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # ours, baselines
-    representation: str = "hvae"  # hvae, hvae-all (oracle), vae, engineered[-5d, -path], FILE.npz
-    modality: str | None = None  # what the action encoder sees (B), see hvae.py
-    split: str = "default"  # into training, validation, test actions (A.1 to A.4): default, full
-    split_seed: int = 0  # seed of that split; published: one split for all seeds
-    recipe: Literal["fast", "paper"] = "fast"  # paper: Tables 3 and 4 to the letter; fast: ours
+    env: Annotated[str, tyro.conf.Positional] = "gridworld"  # or recsys, create, stacking
+    method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # ours or baseline
+    representation: str = "hvae"  # hvae, hvae-all, vae, engineered[-5d, -path], FILE.npz
+    modality: str | None = None  # what the action encoder sees (B)
+    split: str = "default"  # of the actions (A.1 to A.4): default, full, ...
+    split_seed: int = 0  # published: one split for all seeds
+    recipe: Literal["fast", "paper"] = "fast"  # ours, or Tables 3 and 4 to the letter
     quick: bool = False  # the same protocol at a laptop's budget
-    seed: int = 0  # one seed, one run, bit for bit (a GPU adds up in no fixed order)
+    seed: int = 0  # one seed, one run, bit for bit (on a CPU)
     task: str | None = None  # CREATE: which of the 12 tasks (C.1)
-    subgoal_reward: bool = True  # CREATE: --no-subgoal-reward is the experiment of C.3
-    fully_observable: bool = False  # Recommender: a representation holds mu_i, too (C.5)
+    subgoal_reward: bool = True  # CREATE: --no-subgoal-reward is C.3
+    fully_observable: bool = False  # Recommender: c_i holds mu_i, too (C.5)
     placement: str | None = None  # Stacking: none, 1d, 2d (C.6)
-    adapt: bool = False  # C.2: train on the test actions, one fixed set, from scratch
-    finetune: str | None = None  # C.2: --adapt, from this finished run; give that run's flags
+    adapt: bool = False  # C.2: train on the test actions, as one set
+    finetune: str | None = None  # C.2: --adapt, from this run; needs its flags
     ent_coef: float = 0.05  # Table 3; 0: the ablation without entropy
-    ent_floor: float = 1.0  # ours: it decays linearly to this fraction (paper: 1)
+    ent_floor: float = 1.0  # ours: it decays to this fraction (paper: 1)
     num_available: int = 50  # Table 3 "actions per episode", K
-    eval_available: int | None = None  # K of all evaluations (None: num_available, as Table 3)
+    eval_available: int | None = None  # K of evaluations (None: num_available)
     total_timesteps: int = 40_000_000  # Table 3; one step = one action
-    minibatch_size: int = 4096  # Table 3 "PPO batch size" (published code: of a minibatch)
-    num_minibatches: int = 4  # published code; a rollout has so many minibatches
-    subsample: bool = True  # --no-subsample: all training actions in every episode (ablation)
-    fixed_set_size: int | None = None  # then, or with --adapt: only so many of them
+    minibatch_size: int = 4096  # Table 3 "PPO batch size"
+    num_minibatches: int = 4  # published code; so many are a rollout
+    subsample: bool = True  # --no-subsample: always all training actions
+    fixed_set_size: int | None = None  # then, or with --adapt: only so many
     learning_rate: float = 1e-3  # Table 4, of Adam
-    lr_decay_steps: int | None = None  # it decays linearly in so many steps (None: the whole run)
+    lr_decay_steps: int | None = None  # decays in so many steps (None: all)
     gamma: float = 0.99  # Table 4
-    gae_lambda: float = 0.95  # published code
     num_envs: int = 32  # Table 4 "parallel processes"
     hidden_size: int = 64  # Table 4
     vf_coef: float = 0.5  # Table 4
     update_epochs: int = 4  # Table 4
     clip_coef: float = 0.1  # Table 4
     clip_vloss: bool = True  # published code: clip the value's steps, too
-    max_grad_norm: float = 0.5  # published code
-    aux_conditioned: bool = False  # the position depends on the chosen action, too (C.4)
-    one_hot: bool = False  # ours: integer states enter one-hot, not as normalised numbers
-    bilinear: bool = False  # ours: f_nu = c . M f_omega(s), too plain to know single actions
-    small_gains: bool = True  # published code: f_nu starts with gain 0.01 in all three layers
-    ink: bool = False  # ours: pictures at half the size, dark on zero, features normalised
-    eval_every: int = 410_000  # steps between evaluations (published code: 25 updates)
-    valid_episodes: int = 640  # episodes of each of them (published code: 20 x 32)
-    eval_episodes: int = 5000  # episodes of the test (published code: 5,000)
-    hvae_recipe: str = "laptop"  # of the encoder, if its table is not there yet: quick, paper
+    aux_conditioned: bool = False  # C.4: the position sees the chosen action
+    one_hot: bool = False  # ours: integer states enter one-hot
+    bilinear: bool = False  # ours: f_nu = c . M f_omega(s)
+    small_gains: bool = True  # published code: f_nu starts with gains of 0.01
+    ink: bool = False  # ours: small pictures, lines on nothing
+    eval_every: int = 410_000  # steps between evaluations
+    valid_episodes: int = 640  # episodes of each of them
+    eval_episodes: int = 5000  # episodes of the test (published code)
+    hvae_recipe: str = "laptop"  # of the encoder: laptop, quick, paper
     runs_dir: str = "runs"  # runs and representations live here
-    run_name: str | None = None  # the run's folder (None: named after all that differs)
+    run_name: str | None = None  # the run's folder (None: see run_path)
     resume: bool = False  # go on from the checkpoint, bit for bit
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
@@ -134,64 +132,63 @@ TABLE_3 = {
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),  # longer than the run
     "fixed_set_size": (None, 2000, None, None),  # for the cost of all 5,000
     "eval_every": (410_000, 164_000, 615_000, 102_400),  # 25, 20, 50, 25 updates
-    "valid_episodes": (640, 160, 640, 200),  # stacking, published code: 40, too few to choose by
+    "valid_episodes": (640, 160, 640, 200),  # stacking: 40, too few
 }
 COLUMNS_3 = zip(*TABLE_3.values(), strict=True)
 PRESETS = {column[0]: Args(**dict(zip(TABLE_3, column, strict=True))) for column in COLUMNS_3}
-
 # Our recipe: every difference from Tables 3 and 4, with its reason.
 FAST = {
     "gridworld": dict(
         one_hot=True,  # ids are names, not quantities
         minibatch_size=512,  # eight times as many updates per step
-        num_available=20,  # in a smaller set favourites are rarer: more skills get practice
+        num_available=20,  # a smaller set has fewer favourites: more get practice
         eval_available=50,  # ... the tests stay Table 3's
-        ent_floor=0.1,  # explore first, commit later: one stray skill ends in the lava
-        hidden_size=128,  # "left of the river after three moves" takes many units
+        ent_floor=0.1,  # commit in the end: a stray skill ends in lava
+        hidden_size=128,  # many facts about skills and rivers
         small_gains=False,  # 0.01 in all layers starves the gradient at first
         total_timesteps=10_000_000,
     ),
     "recsys": dict(
-        bilinear=True,  # an MLP learns the hidden popularity of single products by heart
-        gamma=0.0,  # hardly any effect on later clicks, whose sum drowns the one that was earned
+        bilinear=True,  # an MLP learns single products by heart
+        gamma=0.0,  # later clicks only drown the one that was earned
         minibatch_size=512,
         num_available=100,  # a fifth of the cost of a step
         eval_available=500,
         total_timesteps=10_000_000,
     ),
     "create": dict(
-        ink=True,  # what all pictures share, white paper, drowns what tells them apart
+        ink=True,  # white paper drowns what tells pictures apart
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         small_gains=False,
-        hidden_size=256,  # which tool, and where in this picture: more to know than in a grid
+        hidden_size=256,  # which tool, and where: more to know
         minibatch_size=256,  # many small updates ...
         num_minibatches=8,
         learning_rate=5e-4,
         clip_coef=0.2,  # goals are rare: let each one teach more
-        vf_coef=0.02,  # a goal is worth 10: at 0.5 the shared convolutions serve the critic alone
-        clip_vloss=False,  # ... and in clipped steps of 0.2 it never gets to 10
+        vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions are the critic's
+        clip_vloss=False,  # ... and clipped steps are too small for it
         total_timesteps=4_000_000,
         eval_every=205_000,
     ),
     "stacking": dict(
         small_gains=False,
-        minibatch_size=32,  # physics is the bill, so learn more from each step of it
+        minibatch_size=32,  # physics is the bill: learn more from it
         clip_vloss=False,
         total_timesteps=400_000,
         eval_every=20_500,
     ),
 }
-# --quick, of either recipe: this budget, 500 episodes as the test, the encoder's quick recipe.
+# --quick: so many steps, 500 test episodes, the encoder's quick recipe.
 QUICK = {"gridworld": 1_500_000, "recsys": 1_000_000, "create": 400_000, "stacking": 60_000}
-CEILINGS = {  # the best such a policy can reach on (seen, unseen) actions, with Table 3's K
-    "gridworld": (1.0, 1.0),  # exact search: all but 1 in 7,000 sets of 50 skills hold a solution
-    "recsys": (0.664, 0.297),  # greedy play; the hidden mu_i can be learned where it is seen
+CEILINGS = {  # best possible on (seen, unseen) actions, with Table 3's K
+    "gridworld": (1.0, 1.0),  # exact search: all but 1 in 7,000 sets
+    "recsys": (0.664, 0.297),  # greedy play; mu_i can be known if seen
     "recsys-full": (0.664, 0.664),
 }
 
 
 def default_args(env: str, recipe: str = "fast", quick: bool = False) -> Args:
-    """Table 3, then our recipe's differences, then --quick. ValueError: unknown environment."""
+    """Table 3, then our differences, then --quick; ValueError for an unknown environment."""
     hvae.load_environment(env)
     args = replace(PRESETS.get(env, Args(env)), recipe=recipe, quick=quick)
     if recipe == "fast":
@@ -218,16 +215,15 @@ def mlp(inputs: int, H: int) -> nn.Sequential:
 
 
 def cnn(frames: int, H: int, ink: bool) -> nn.Sequential:
-    """f_omega of pictures (D.3.2): "5-layer convolutional network", linear layer, ReLU."""
-    # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side; ink enters at 42: a layer less
+    """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU."""
+    # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side; ink starts at 42
     channels, layers = [frames, 16, *[16] * (not ink), 32, 32, 32], []
     for into, out in pairwise(channels):
         conv = nn.Conv2d(into, out, 3, stride=2, padding=1)
-        # published code: PyTorch's own weights, through which two pictures end up almost the same
+        # published code: PyTorch's own weights; they hide what differs between pictures
         layers += [layer_init(conv) if ink else conv, nn.ReLU()]
-    layers += [nn.Flatten()]  # (B, 32, 3, 3) -> (B, 288)
-    if ink:  # features of one size, whether there are few lines on the picture or many
-        layers += [nn.LayerNorm(288, elementwise_affine=False)]
+    # (B, 32, 3, 3) -> (B, 288); ink, few lines on the picture or many: features of one size
+    layers += [nn.Flatten(), *[nn.LayerNorm(288, elementwise_affine=False)] * ink]
     return nn.Sequential(*layers, layer_init(nn.Linear(288, H)), nn.ReLU())
 
 
@@ -235,7 +231,7 @@ def position_head(H: int, d: int, args: Args) -> nn.Module:
     """D.3.2: linear, of the code (B, H). C.4: two layers, of [code; action] (B, 2H)."""
     if not args.aux_conditioned:
         return layer_init(nn.Linear(H, d), 1.0)
-    # published code: gain 1, each tool has a random place at first; ours: all have the same one
+    # published code: gain 1, at first a random place per tool; ours: one place
     out = layer_init(nn.Linear(H, d), 1.0 if args.small_gains else 0.01)
     return nn.Sequential(layer_init(nn.Linear(2 * H, H), 1.0), nn.ReLU(), out)
 
@@ -243,17 +239,17 @@ def position_head(H: int, d: int, args: Args) -> nn.Module:
 def as_ink(frames: torch.Tensor) -> torch.Tensor:
     """Pictures (N, C, 84, 84) uint8, black on white -> (N, C, 42, 42) uint8, 255 on 0."""
     rows = frames[:, :, ::2].float() + frames[:, :, 1::2]  # (N, C, 42, 84)
-    ink = 255 - (rows[..., ::2] + rows[..., 1::2]) / 4  # (N, C, 42, 42): means of 2 x 2 pixels
-    return (ink * frames.flatten(2).any(2)[..., None, None]).byte()  # all black: before the episode
+    ink = 255 - (rows[..., ::2] + rows[..., 1::2]) / 4  # (N, C, 42, 42)
+    return (ink * frames.flatten(2).any(2)[..., None, None]).byte()  # black: no frame
 
 
 class RunningMeanStd(nn.Module):
-    """Mean and std of a stream of numbers: their count, sum and sum of squares, in float64."""
+    """Mean and std of a stream of numbers: count, sum, sum of squares in float64."""
 
     def __init__(self, shape: tuple[int, ...] = ()):
         super().__init__()
         prior = [torch.full(shape, x, dtype=torch.float64) for x in (1e-4, 0.0, 1e-4)]
-        self.register_buffer("sums", torch.stack(prior))  # published code: mean 0, std 1
+        self.register_buffer("sums", torch.stack(prior))  # published code
 
     def update(self, x: torch.Tensor) -> None:
         """Add a batch (n, *shape), those of all processes together."""
@@ -262,15 +258,15 @@ class RunningMeanStd(nn.Module):
 
     def mean_std(self) -> tuple[torch.Tensor, torch.Tensor]:
         mean, square = self.sums[1:] / self.sums[0]
-        return mean.float(), (square - mean.square() + 1e-8).sqrt().float()  # 1e-8: published code
+        return mean.float(), (square - mean.square() + 1e-8).sqrt().float()
 
 
 def utility(u, P, w, available):
     """logits[b, k] = w . relu(u[b] + P[available[b, k]]), for all k on offer.
 
-    The hidden layer of f_nu acts on the concatenation [state code s; projected action A c + a], so
-    its product splits: W [s; A c + a] + b = W_s s + (W_c (A c + a) + b) = u + P. The state's part u
-    is computed once per state, the action's part P once per action of the whole table.
+    The hidden layer of f_nu sees the concatenation [code s; projected action A c + a]. It splits:
+    W [s; A c + a] + b = W_s s + (W_c (A c + a) + b) = u + P, with u once per state, and P once per
+    action of the whole table.
     """
     x = u[:, None] + P[available]  # (B, 1, H) + (B, K, H)
     return F.relu(x) @ w  # (B, K, H) @ (H,) -> (B, K)
@@ -315,11 +311,11 @@ class Agent(nn.Module):
 
     def __init__(self, envs: VectorEnv, table, train_ids, args: Args):
         super().__init__()
-        shape, heads = envs.single_observation_space["state"].shape, envs.single_action_space
-        H, D, self.args, self.is_image = args.hidden_size, table.shape[1], args, len(shape) == 3
+        shape, self.args = envs.single_observation_space["state"].shape, args
+        H, D, self.is_image = args.hidden_size, table.shape[1], len(shape) == 3
         self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
         self.register_buffer("train_ids", torch.tensor(train_ids))  # (n,)
-        # State encoder and critic: pictures share the convolutions, vectors share nothing.
+        # State encoder and critic share the convolutions; without pictures, nothing.
         if self.is_image:
             self.encoder, self.critic = cnn(shape[0], H, args.ink), layer_init(nn.Linear(H, 1))
         else:
@@ -330,8 +326,7 @@ class Agent(nn.Module):
                 width *= len(ids)
             self.encoder = mlp(width, H)
             self.critic = nn.Sequential(mlp(width, H), layer_init(nn.Linear(H, 1)))
-        # Utility function. Gain 0.01 in all three layers (published code) starts from the uniform
-        # policy, but also with gradients of about 1e-6, as small as Adam's epsilon.
+        # Utility. Gains of 0.01 (published code) make a uniform policy, and gradients of 1e-6.
         project, hidden, out = (0.01,) * 3 if args.small_gains else (1.0, math.sqrt(2), 0.01)
         if args.method == "utility" and not args.bilinear or args.aux_conditioned:
             self.action_project = layer_init(nn.Linear(D, H), project)
@@ -344,8 +339,7 @@ class Agent(nn.Module):
         else:
             self.utility_hidden = layer_init(nn.Linear(2 * H, H), hidden)
             self.utility_out = layer_init(nn.Linear(H, 1), out)
-        # Auxiliary policy, where there is more to choose than an action.
-        heads = getattr(heads, "spaces", {})
+        heads = getattr(envs.single_action_space, "spaces", {})
         self.has_position, self.has_stop = "position" in heads, "stop" in heads
         if self.has_position:
             d = heads["position"].shape[0]
@@ -356,7 +350,7 @@ class Agent(nn.Module):
                 nn.init.constant_(self.fc_stop.bias[0], 4.0)
 
     def see(self, obs: dict[str, np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the environments show as tensors: state (N, ...) and ids on offer (N, K)."""
+        """An observation as tensors: state (N, ...) and ids on offer (N, K)."""
         state, available = (torch.as_tensor(obs[k]) for k in ("state", "available"))
         state = as_ink(state) if self.args.ink else state
         return state.to(self.table.device), available.to(self.table.device)
@@ -375,7 +369,7 @@ class Agent(nn.Module):
         return self.encoder(x), self.critic(x)[:, 0]
 
     def project_actions(self, ids: torch.Tensor | None = None) -> torch.Tensor:
-        """P, the action's part of `utility`: of all actions (A, H), or of `ids` (n,) (n, H)."""
+        """P, the action's part of `utility`: for all (A, H), or for `ids` (n, H)."""
         table = self.table if ids is None else self.table[ids]
         if self.args.method != "utility" or self.args.bilinear:
             return table
@@ -383,7 +377,7 @@ class Agent(nn.Module):
         return self.action_project(table) @ W_c.T + self.utility_hidden.bias
 
     def choice_logits(self, code, available, P):
-        """Code (B, H), rows of P on offer (B, K) -> logits (B, K) [nearest neighbour: (B, n)]."""
+        """Code (B, H), rows of P on offer (B, K) -> logits (B, K) or, nearest neighbour, (B, n)."""
         if self.args.method == "nearest-neighbor":
             return self.head(code)
         if self.args.bilinear:  # (B, 1, D) @ (B, D, K) -> (B, 1, K)
@@ -393,9 +387,9 @@ class Agent(nn.Module):
         return score(u, P, self.utility_out.weight[0], available) + self.utility_out.bias
 
     def slot(self, output, available):
-        """The slot (B,) of the set on offer that an output of the policy stands for."""
-        # Baselines: the action nearest to the training action, or to the point (B, D), which the
-        # policy names. That is part of the environment: no gradient goes through it.
+        """Output of the policy -> slot (B,) of the set on offer."""
+        # Baselines: the action nearest to the training action or to the point (B, D) that is put
+        # out. This is part of the environment: no gradient goes through it.
         if self.args.method == "utility":
             return output
         if self.args.method == "nearest-neighbor":
@@ -426,8 +420,8 @@ class Agent(nn.Module):
             action["taken"] = available.gather(1, action["choice"][:, None])[:, 0]
         logprob, entropy = policy.log_prob(action["output"]), policy.entropy()
         if self.args.method == "continuous":
-            # published code: entropy is the sum in Grid World, else the mean; we: the mean, so that
-            # the coefficient means the same whatever D is. Its clamp is the published code's.
+            # published code: the sum of entropies in Grid World, else the mean; we: the mean, so
+            # that its coefficient does not depend on D. The clamp is the published code's.
             logprob, entropy = logprob.sum(1).clamp(-1e5, 1e5), entropy.mean(1)
         if self.has_position:
             x = code
@@ -437,8 +431,8 @@ class Agent(nn.Module):
             place = Beta(1 + F.softplus(self.fc_alpha(x)), 1 + F.softplus(self.fc_beta(x)))
             if new:
                 action["position"] = 2 * draw(place) - 1  # (B, d) in [-1, 1]
-            # float32 can round to the border, where the density may be infinite. That of [-1, 1] is
-            # half of it per dimension, a constant that PPO's ratio does not see.
+            # float32 can round to the border, where the density may be infinite. Half of it per
+            # dimension is the density on [-1, 1]: PPO's ratio does not see a constant.
             unit = (0.5 + action["position"] / 2).clamp(1e-6, 1 - 1e-6)
             logprob = logprob + place.log_prob(unit).sum(1)
             entropy = entropy + AUX_ENT_SCALE * place.entropy().sum(1)
@@ -453,11 +447,11 @@ class Agent(nn.Module):
 # ---- Algorithm 1: rollout, advantages, update ----
 @torch.no_grad()
 def step(envs, obs, agent: Agent, P, greedy: bool = False):
-    """One step: returns the transition, who is done (N,), their episodes (N, 3), the next obs."""
+    """One step: the transition, done (N,), finished episodes (N, 3), the next obs."""
     state, available = agent.see(obs)
     action, logprob, _, value = agent.act(state, available, P, greedy=greedy)
     parts = {k: action[k].cpu().numpy() for k in ("choice", "position", "stop") if k in action}
-    executed = parts if len(parts) > 1 else parts["choice"]  # slots (N,), if there is nothing else
+    executed = parts if len(parts) > 1 else parts["choice"]  # slots (N,) alone
     obs, reward, terminated, truncated, infos = envs.step(executed)
     # Time limits count as ends: short, and part of these tasks (published code).
     done, episodes = terminated | truncated, None
@@ -470,8 +464,8 @@ def step(envs, obs, agent: Agent, P, greedy: bool = False):
 
 
 def rollout(envs, obs, agent: Agent, num_steps: int):
-    """Collect T steps: returns a batch of (T, N, ...) tensors, the next obs, finished episodes."""
-    # Stored are ids (T, N, K): the update takes the softmax over the set that was on offer.
+    """Collect T steps: a batch of (T, N, ...) tensors, the next obs, finished episodes."""
+    # It holds ids (T, N, K): the update takes the softmax over what was on offer.
     P, steps, finished = agent.project_actions(), [], []
     for _ in range(num_steps):
         taken, done, episodes, obs = step(envs, obs, agent, P)
@@ -480,8 +474,8 @@ def rollout(envs, obs, agent: Agent, num_steps: int):
     return {k: torch.stack([s[k] for s in steps]) for k in steps[0]}, obs, finished
 
 
-def gae(rewards, values, dones, next_value, gamma: float, lam: float):
-    """Generalised advantage estimation, backwards in time; all (T, N), next_value (N,).
+def gae(rewards, values, dones, next_value, gamma: float, lam: float = 0.95):
+    """Generalised advantage estimation; all (T, N), next_value (N,).
 
     delta_t = r_t + gamma (1 - done_t) V_{t+1} - V_t
     A_t = delta_t + gamma lam (1 - done_t) A_{t+1}
@@ -496,7 +490,7 @@ def gae(rewards, values, dones, next_value, gamma: float, lam: float):
 
 
 def discounted_returns(rewards, dones, G, gamma: float):
-    """G <- gamma G + r, over the steps of a rollout (T, N); returns (T, N) and the last G (N,)."""
+    """G <- gamma G + r over a rollout: all of them (T, N) and the last one (N,)."""
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
         returns[t] = G = gamma * G + rewards[t]
@@ -519,41 +513,41 @@ def ppo_loss(agent: Agent, mb: dict, P, ent_coef: float, args: Args):
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
     parts = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy)
     parts["clip_fraction"] = ((ratio - 1).abs() > args.clip_coef).float().mean()
-    parts["approx_kl"] = (ratio - 1 - logratio).mean()  # E[r - 1 - log r], r under the old policy
+    parts["approx_kl"] = (ratio - 1 - logratio).mean()  # E[r - 1 - log r]
     return loss, parts
 
 
 def update(agent: Agent, optimizer, batch: dict, ent_coef: float, args: Args) -> dict[str, float]:
     """PPO's epochs over one rollout; returns the parts of the loss."""
     b = {k: v.flatten(0, 1) for k, v in batch.items()}  # (T, N, ...) -> (T * N, ...)
-    # Only training actions were on offer, so only their rows of P are computed: ids -> rows.
+    # Only training actions were on offer: only their rows of P are computed.
     row = torch.zeros(len(agent.table), dtype=torch.int64, device=agent.table.device)
     row[agent.train_ids] = torch.arange(len(agent.train_ids), device=row.device)
     b["available"] = row[b["available"]]  # (T * N, K)
-    # published code: normalised once over the rollout, the same numbers in every epoch
+    # published code: normalised once, over the whole rollout
     everyones = torch.cat(everyone(b["advantage"]))
     b["advantage"] = (b["advantage"] - everyones.mean()) / (everyones.std() + 1e-5)
     size, parameters = args.minibatch_size // WORLD_SIZE, list(agent.parameters())
     for _ in range(args.update_epochs):
         for mb_inds in torch.randperm(len(b["value"]), device=row.device).split(size):
             mb = {k: v.index_select(0, mb_inds) for k, v in b.items()}
-            P = agent.project_actions(agent.train_ids)  # (n, H): the weights have changed
+            P = agent.project_actions(agent.train_ids)  # (n, H)
             loss, parts = ppo_loss(agent, mb, P, ent_coef, args)
             optimizer.zero_grad()
             loss.backward()
-            for p in parameters if WORLD_SIZE > 1 else ():  # shares of equal size: their mean
+            for p in parameters if WORLD_SIZE > 1 else ():  # equal shares: their mean
                 dist.all_reduce(p.grad)
                 p.grad /= WORLD_SIZE
-            nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
+            nn.utils.clip_grad_norm_(parameters, 0.5)  # published code
             optimizer.step()
-    return {name: part.item() for name, part in parts.items()}  # of the last minibatch (CleanRL)
+    return {name: part.item() for name, part in parts.items()}  # of the last one
 
 
 def everyone(x) -> list:
     """Everyone's `x`, in the order of the ranks; all of them wait here.
 
-    torchrun: each process (rank) plays its share of the environments and learns from its share of
-    each minibatch. Rank 0 alone evaluates, writes and speaks.
+    torchrun: each process (rank) plays its share of the environments, and learns from its share
+    of each minibatch. Rank 0 alone evaluates, writes and speaks.
     """
     parts = [x] * WORLD_SIZE
     if WORLD_SIZE > 1:
@@ -562,13 +556,13 @@ def everyone(x) -> list:
 
 
 # ---- what is on offer, what is known about it, and what cannot be trained ----
-OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}  # of the environments
+OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}  # of envs
 ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
 
 
 def seeds(n: int, *stream: int) -> list[int]:
-    """`n` seeds of one stream of random numbers: the run's seed, then what it is for."""
-    # 1 training, 2 weights and policy, 3 validation, 4 test, 5 evaluate. No two streams share any.
+    """`n` seeds of one stream of random numbers, independent of all other streams."""
+    # It is named by the seed and by: 1 training, 2 PyTorch, 3 validation, 4 test, 5 evaluate.
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -578,21 +572,21 @@ def task_options(args: Args) -> dict:
 
 
 def make_envs(args: Args, pool, num_envs: int, num_available: int, *stream: int):
-    """Environments that offer `num_available` actions of `pool` in every episode; see `seeds`."""
+    """Environments that offer `num_available` actions of `pool` per episode."""
     make_vec = hvae.load_environment(args.env).make_vec
     envs = make_vec(num_envs, pool, num_available, list(stream), **task_options(args))
     return RecordEpisodeStatistics(envs)
 
 
 def action_pools(args: Args) -> tuple[dict[str, tuple], np.ndarray]:
-    """(Sorted ids, K on offer) of each phase, and all ids (n,) that are on offer in training."""
-    # "learn" is the training itself, "train", "valid" and "test" are evaluations. What learns with
-    # one fixed set is scored on it (published code). After adaptation there is nothing else.
+    """(Sorted ids, K on offer) of each phase; all ids (n,) on offer in training."""
+    # "learn" is the training itself; "train", "valid", "test" are evaluations. What learns from one
+    # set is scored on it (published code), and after adaptation on nothing else.
     module = hvae.load_environment(args.env)
     split = module.split_actions(args.split, args.split_seed)
     pool, K = split["test" if args.adapt else "train"], args.num_available
     eval_K = args.eval_available or K
-    no_op = [module.NO_OP] if hasattr(module, "NO_OP") else []  # CREATE: always on offer, counts
+    no_op = [module.NO_OP] if hasattr(module, "NO_OP") else []  # CREATE
     one_set = args.method == "nearest-neighbor" or args.adapt or not args.subsample
     if one_set:
         if args.fixed_set_size and args.method != "nearest-neighbor":
@@ -602,19 +596,17 @@ def action_pools(args: Args) -> tuple[dict[str, tuple], np.ndarray]:
     phases = {"learn": (pool, K), "train": (pool, K if one_set else eval_K)}
     phases |= {} if args.adapt else {p: (split[p], eval_K) for p in ("valid", "test")}
     for phase, (ids, k) in phases.items():
-        if k > len(ids) + len(no_op):  # num_available; in evaluations eval_available, if given
+        if k > len(ids) + len(no_op):
             raise ValueError(f"{k} on offer out of {len(ids) + len(no_op)} actions ({phase})")
     return phases, np.union1d(no_op, pool).astype(np.int64)
 
 
 def load_table(args: Args) -> np.ndarray:
-    """The representations (A, D); trains the encoder first if they are not there yet."""
+    """The representations (A, D); trains the encoder if they are not there yet."""
     if args.finetune:
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
     kind, _, variant = args.representation.partition("-")
     if kind == "engineered":
-        if variant and args.env != "gridworld":
-            raise ValueError(f"{args.env} has no representation {args.representation!r}")
         options = dict(variant=variant) if variant else {}
         options |= dict(fully_observable=True) if args.fully_observable else {}
         return hvae.load_environment(args.env).engineered_representations(**options)
@@ -626,17 +618,17 @@ def load_table(args: Args) -> np.ndarray:
         encoder = replace(encoder, **same, **ENCODERS[args.representation])
         path, wanted = hvae.representation_path(encoder), vars(encoder)
         if not path.exists():
-            print(f"no representations at {path} yet: training the encoder first", flush=True)
+            print(f"no {path} yet: training the encoder first", flush=True)
             hvae.train(encoder)
     loaded = hvae.load_representation(path, args.env, args.split, args.split_seed)
     there = loaded["config"]
     if stale := [k for k in wanted if there.get(k, wanted[k]) != wanted[k]]:
-        raise ValueError(f"{path} has other {', '.join(stale)} than the recipe now: delete it")
+        raise ValueError(f"{path} has another {stale[0]} than the recipe: delete it")
     return loaded["mean"]
 
 
 def check(args: Args) -> None:
-    """Refuse in one line, before anything is made, what cannot be trained or changes nothing."""
+    """Refuse, before anything is made, what cannot be trained or has no effect."""
     for name, value in vars(args).items():
         if type(value) is int and value < (0 if "seed" in name else 1):
             raise ValueError(f"{name} {value} is too small")
@@ -649,18 +641,18 @@ def check(args: Args) -> None:
     env, nearest, utility = args.env, args.method == "nearest-neighbor", args.method == "utility"
     learned, default = args.representation in ENCODERS, default_args(env, args.recipe, args.quick)
     one_set = nearest or args.adapt or not args.subsample
-    effects = {  # flags: whether they change anything. Else a run named after one would be a lie.
+    effects = {  # flags: whether they change anything; a run is named after them
         "modality hvae_recipe": learned,
         "task subgoal_reward": env == "create",
         "placement": env == "stacking",
         "fully_observable": env == "recsys" and not learned,
+        "representation": env == "gridworld" or not args.representation.startswith("engineered-"),
         "ent_floor": args.ent_coef > 0,
         "num_available": not one_set or not (args.eval_available or args.adapt),
         "eval_available": not args.adapt,
         "subsample": not nearest and not args.adapt,  # these have one set anyway
         "device": args.device != "cuda" or torch.cuda.is_available(),
         "fixed_set_size": one_set and not nearest,
-        "gae_lambda": args.gamma > 0,
         "aux_conditioned": env == "create" or args.placement in ("1d", "2d"),
         "one_hot": env not in ("recsys", "create", "stacking"),  # states of integers
         "ink": env not in ("gridworld", "recsys"),  # pictures
@@ -670,22 +662,22 @@ def check(args: Args) -> None:
     for flags, has_effect in effects.items():
         for flag in flags.split() if not has_effect else ():
             if getattr(args, flag) != getattr(default, flag):
-                raise ValueError(f"{flag} {getattr(args, flag)} has no effect here")
+                raise ValueError(f"{flag} {getattr(args, flag)} has no effect or sense here")
     if args.finetune:
         theirs = load(Path(args.finetune) / "best.pt")["args"]
         same = "env method representation modality split split_seed fully_observable placement"
         for name in f"{same} hidden_size one_hot bilinear ink aux_conditioned".split():
             if (there := getattr(theirs, name)) != getattr(args, name):
-                raise ValueError(f"cannot fine-tune {args.finetune}: {name} is {there!r} there")
+                raise ValueError(f"{args.finetune} cannot be fine-tuned: its {name} is {there!r}")
 
 
 # ---- Algorithm 1: the training loop ----
 def train(args: Args) -> dict:
     """Learn, select on validation actions, test once; returns what results.json holds."""
-    from torch.utils.tensorboard import SummaryWriter  # takes 1.5 s, so not for `evaluate`
+    from torch.utils.tensorboard import SummaryWriter  # takes 1.5 s
 
     check(args)
-    cuda = args.device != "cpu" and torch.cuda.is_available()  # torchrun: one for each process
+    cuda = args.device != "cpu" and torch.cuda.is_available()
     device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if cuda else "cpu")
     N, batch_size = args.num_envs // WORLD_SIZE, args.minibatch_size * args.num_minibatches
     phases, train_ids = action_pools(args)
@@ -694,11 +686,11 @@ def train(args: Args) -> dict:
     folder, table, checkpoint = everyone(None if RANK else open_run(args))[0]
     torch.manual_seed(seeds(1, args.seed, 2, RANK)[0])
     agent = Agent(envs, table, train_ids, args).to(device)
-    if args.finetune:  # published code: outputs of the discrete policy are actions, so they are new
+    if args.finetune:  # published code: discrete outputs are actions, so they are new
         theirs, own = load(Path(args.finetune) / "best.pt")["agent"], agent.state_dict()
         new = ("train_ids", *["head.", "fc_stop."] * (args.method == "nearest-neighbor"))
         agent.load_state_dict({k: (own if k.startswith(new) else theirs)[k] for k in own})
-    agent.load_state_dict(everyone(agent.state_dict())[0])  # the same weights everywhere
+    agent.load_state_dict(everyone(agent.state_dict())[0])  # rank 0's
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
     reward_stats, G = RunningMeanStd().to(device), torch.zeros(N, device=device)
     generator = torch.cuda if cuda else torch
@@ -708,7 +700,6 @@ def train(args: Args) -> dict:
             part.load_state_dict(checkpoint[name])
         generator.set_rng_state(checkpoint["generators"][RANK])
         update_index, seconds, best_score, size = checkpoint["progress"]
-
     num_updates = args.total_timesteps // batch_size
     eval_every = max(1, args.eval_every // batch_size)  # in updates
     decay_updates = max(1, (args.lr_decay_steps or args.total_timesteps) // batch_size)
@@ -719,29 +710,28 @@ def train(args: Args) -> dict:
     while update_index < num_updates:
         began = time.perf_counter()
         left = 1 - min(1.0, update_index / decay_updates)
-        lr = args.learning_rate * (0.1 + 0.9 * left)  # D.2 "linear decay"; published code: to 0.1
+        lr = args.learning_rate * (0.1 + 0.9 * left)  # D.2; published code: to 0.1
         optimizer.param_groups[0]["lr"] = lr
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * left)
 
         # Collect: every episode draws its own subset of the training actions.
         batch, obs, episodes = rollout(envs, obs, agent, batch_size // args.num_envs)
         rewards = batch["reward"]
-        if not agent.is_image:  # published code: over the running std of their discounted sum
+        if not agent.is_image:  # published code: only vectors
             returns, G = discounted_returns(rewards, batch["done"], G, args.gamma)
             reward_stats.update(returns.flatten())
             rewards = (rewards / reward_stats.mean_std()[1]).clamp(-10, 10)
         with torch.no_grad():
             next_value = agent.encode(agent.see(obs)[0])[1]  # (N,)
-        values, dones = batch["value"], batch["done"]
-        batch["advantage"] = gae(rewards, values, dones, next_value, args.gamma, args.gae_lambda)
+        batch["advantage"] = gae(rewards, batch["value"], batch["done"], next_value, args.gamma)
         batch["return"] = batch["advantage"] + batch["value"]
 
-        # Learn. Then the normaliser catches up: the policy that collects is the one that learns.
+        # Learn. Then the normaliser catches up: what collects is what learns.
         row = update(agent, optimizer, batch, ent_coef, args)
-        if not (agent.is_image or args.one_hot or args.finetune):  # C.2, published code: frozen
+        if not (agent.is_image or args.one_hot or args.finetune):  # C.2: frozen
             agent.obs_stats.update(batch["state"].flatten(0, 1))
         if not all(p.isfinite().all() for p in agent.parameters()):
-            raise ValueError(f"learning_rate {args.learning_rate} is too high: weights are NaN")
+            raise ValueError(f"learning_rate {args.learning_rate} is too high: NaN")
         update_index += 1
         row |= dict(step=update_index * batch_size, learning_rate=lr)
         if episodes := sum(everyone(episodes), []):
@@ -766,7 +756,7 @@ def train(args: Args) -> dict:
             state["generators"] = torch.stack(everyone(generator.get_rng_state()))
             if not RANK:
                 hvae.write(folder / "checkpoint.pt", partial(torch.save, state))
-            # Episodes start afresh, killed or not: so a resumed run repeats an unbroken one.
+            # Episodes start afresh: a resumed run repeats an unbroken one.
             obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
             G = torch.zeros_like(G)
     envs.close()
@@ -776,8 +766,8 @@ def train(args: Args) -> dict:
 # ---- Algorithm 2: acting with new actions ----
 def evaluate(agent: Agent, offer: tuple, episodes: int, stream: tuple, greedy=False) -> dict:
     """Score of the frozen policy; `offer` is (sorted ids, K on offer), `stream`: see `seeds`."""
-    # published code: 40 x 125 episodes, the first 5,000 to finish; we: as many in every
-    # environment, because those that finish first are the short ones
+    # published code: the first 5,000 episodes to finish in 40 environments; we: as many in each,
+    # because those that finish first are the short ones
     N = min(episodes, 40)
     quota, results = episodes // N + (np.arange(N) < episodes % N), []  # left to play, (N,)
     envs = make_envs(agent.args, offer[0], N, offer[1], *stream)
@@ -793,7 +783,7 @@ def evaluate(agent: Agent, offer: tuple, episodes: int, stream: tuple, greedy=Fa
 
 
 # ---- what a run leaves behind ----
-METHODS = {  # of results/published_results.csv, and what sets each of them apart from ours
+METHODS = {  # of published_results.csv, and what sets each apart from ours
     "nearest_neighbor": ("method", "nearest-neighbor"),
     "continuous_output": ("method", "continuous"),
     "ours_no_subsampling": ("subsample", False),
@@ -814,7 +804,7 @@ APART = "env task fully_observable recipe quick seed bilinear adapt finetune".sp
 
 
 def describe(args: Args) -> tuple[str, str, dict]:
-    """The experiment <env>[-task][-full], the method, all else that is not as in the recipe."""
+    """The experiment, the method, all else that is not as in the recipe."""
     default = vars(default_args(args.env, args.recipe, args.quick))
     others = {k: v for k, v in vars(args).items() if v != default[k] and k not in FREE + APART}
     found = [m for m, change in METHODS.items() if change in others.items()]
@@ -823,8 +813,7 @@ def describe(args: Args) -> tuple[str, str, dict]:
     method = found[0] if found else "ours"
     # C.2; from which run is not in the name: a second one is refused
     method += "_finetuned" if args.finetune else "_from_scratch" * args.adapt
-    if args.bilinear and args.method == "utility":
-        method += "_bilinear"  # not the paper's utility
+    method += "_bilinear" * (args.bilinear and args.method == "utility")  # not the paper's
     experiment = args.env, args.task, "full" if args.fully_observable else None
     return "-".join(filter(None, experiment)), method, others
 
@@ -849,9 +838,9 @@ def published_scores(args: Args) -> dict[str, float]:
 
 
 def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
-    """Claim the run's folder: returns it, the representations, and the checkpoint to go on from."""
-    # Making the folder is the claim. If the representations then fail, it is given back. A run that
-    # was killed later goes on with --resume: from its checkpoint, or else from the beginning.
+    """Claim the run's folder: it, the representations, the checkpoint to go on from."""
+    # Making the folder is the claim. If representations fail, it is given back. What is killed
+    # later goes on with --resume, from its checkpoint or the beginning.
     folder = run_path(args)
     saved, path = folder / "args.json", folder / "checkpoint.pt"
     if is_new := not (args.resume and saved.exists()):
@@ -873,12 +862,12 @@ def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
 
 
 def load(path: Path) -> dict:
-    """A checkpoint, with Args as "args". Runs no code in it; ValueError if it is damaged."""
+    """A checkpoint, its "args" as Args. No code in it is run; ValueError if damaged."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         return checkpoint | dict(args=Args(**checkpoint["args"]))
-    except Exception as e:  # torch has a dozen kinds of errors for a file that is not its own
-        raise ValueError(f"{path}: no checkpoint of this script ({type(e).__name__})") from None
+    except Exception as e:  # torch has a dozen kinds of errors
+        raise ValueError(f"{path} is no checkpoint: {type(e).__name__}") from None
 
 
 COLUMNS = (
@@ -921,7 +910,6 @@ def finish(folder: Path, agent: Agent, phases: dict, steps: int, seconds: float)
         record_episode(agent, offer, folder / "episode.gif", args.seed)
     except Exception as e:  # whatever it is, the results are safe
         print(f"note: a picture is missing: {type(e).__name__}: {e}")
-    # The last thing on the screen: seen against unseen; ours, published, the best possible.
     print(f"\n{metric:10} {'ours':>14} {'published':>10} {'ceiling':>8}   ({method})")
     names = ["adapted to"] if args.adapt else ["seen", "validation", "unseen"]
     for phase, name in zip(phases, names, strict=True):
@@ -934,13 +922,13 @@ def finish(folder: Path, agent: Agent, phases: dict, steps: int, seconds: float)
 
 
 def plot_curve(folder: Path, results: dict) -> None:
-    """Train and validation score over steps as curve.png, raw: not held at their maximum."""
+    """Scores over steps as curve.png, raw: not held at their maximum."""
+    os.environ.pop("MPLBACKEND", None)  # a notebook's can end the import
     from matplotlib.figure import Figure  # not pyplot: that would look for a display
 
     rows = csv.DictReader((folder / "metrics.csv").read_text().splitlines())
     rows = [row for row in rows if row["train_score"]]
-    figure = Figure(figsize=(6, 4), layout="tight")
-    axes = figure.subplots()
+    axes = (figure := Figure(figsize=(6, 4), layout="tight")).subplots()
     for name in [n for n in ("train_score", "valid_score") if rows[0][n]]:
         points = [(int(row["step"]) / 1e6, float(row[name])) for row in rows]
         axes.plot(*zip(*points, strict=True), marker=".", label=name)
@@ -953,8 +941,7 @@ def record_episode(agent: Agent, offer: tuple, path: Path, seed: int) -> None:
     """Play one episode and save it as a GIF, in colour."""
     args, module = agent.args, hvae.load_environment(agent.args.env)
     name = {"gridworld": "GridWorld", "recsys": "RecSys"}.get(args.env, args.env.capitalize())
-    make = getattr(module, f"{name}Env")
-    env = make(*offer, render_mode="rgb_array", **task_options(args))
+    env = getattr(module, f"{name}Env")(*offer, render_mode="rgb_array", **task_options(args))
     envs = SyncVectorEnv([lambda: env], autoreset_mode=AutoresetMode.DISABLED)
     (obs, _), P, done, frames = envs.reset(seed=seed), agent.project_actions(), [False], []
     frames += [env.render()]
@@ -965,17 +952,17 @@ def record_episode(agent: Agent, offer: tuple, path: Path, seed: int) -> None:
     module.save_gif(path, frames, fps=env.metadata["render_fps"])
 
 
-# ---- python ppo_actiongen.py evaluate RUN: other action sets, and the analyses of A.3 ----
+# ---- python ppo_actiongen.py evaluate RUN: other sets, the analyses of A.3 ----
 @dataclass
 class EvaluateArgs:
-    """Score a run's best checkpoint, the file best.pt in its folder, with any actions."""
+    """Score best.pt of a run with any actions."""
 
     run: tyro.conf.Positional[str]  # folder of the run
     actions: Literal["train", "valid", "test"] = "test"  # which of them are on offer
     num_available: int | None = None  # K (None: as in the run's own test)
-    min_angle_gap: float | None = None  # CREATE: degrees to the nearest training tool of its class
-    min_embedding_distance: str | None = None  # squared, to training actions; q0.5: a quantile
-    unseen_ratio: float | None = None  # a mixture: this share, and the rest training actions
+    min_angle_gap: float | None = None  # CREATE: degrees to training tools
+    min_embedding_distance: str | None = None  # squared; or a quantile: q0.5
+    unseen_ratio: float | None = None  # this share, the rest training actions
     greedy: bool = False  # take the likeliest choice and the mean position
     episodes: int = 5000  # to play
     seed: int = 0  # of environments and policy
@@ -984,7 +971,7 @@ class EvaluateArgs:
 
 
 def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
-    """The analyses of A.3: which actions of `pool` (m,) are on offer; `known` (n,): trained on."""
+    """The analyses of A.3: which of `pool` (m,) are on offer; `known` (n,) were trained on."""
     analyses = options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio
     gap, distance, ratio = analyses
     if analyses != (None, None, None) and np.isin(pool, known).any():
@@ -993,13 +980,12 @@ def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
         create_env = hvae.load_environment("create")  # no other actions have angles
         pool = pool[create_env.angle_gaps(pool, known) >= gap]
     if distance is not None:
-        exact = "donot_use_mm_for_euclid_dist"
-        squared = torch.cdist(table[pool], table[known], compute_mode=exact).amin(1).square()
-        # published: absolute distances, which depend on the scale of the encoder's table
+        squared = torch.cdist(table[pool].double(), table[known].double()).amin(1).square()
+        # published: absolute distances, which depend on the encoder
         least = float(distance.removeprefix("q"))
         least = float(squared.quantile(least)) if distance[0] == "q" else least
         pool = pool[squared.numpy() >= least]
-    if ratio is not None:  # two pools of one size, so that the ratio is that of what is offered
+    if ratio is not None:  # of two pools of one size, so that it is that of what is on offer
         rng, size = np.random.default_rng(options.seed), min(len(pool), len(known))
         count = round(ratio * size)
         unseen = rng.choice(pool, count, replace=False)
@@ -1012,11 +998,10 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     best = load(Path(options.run) / "best.pt")
     args, weights, stream = best["args"], best["agent"], (options.seed, 5)
     phases, train_ids = action_pools(args)
-    # What adapted knows the test actions alone, all of them on offer.
-    pool, K = phases["train" if args.adapt else options.actions]
+    pool, K = phases["train" if args.adapt else options.actions]  # adapted: to the test actions
     pool = restrict_pool(options, weights["table"], pool, phases["learn"][0])
     offer = pool, options.num_available or min(K, len(pool))
-    envs = make_envs(args, pool, 1, offer[1], *stream)  # ValueError: more than there are
+    envs = make_envs(args, pool, 1, offer[1], *stream)
     agent = Agent(envs, weights["table"].numpy(), train_ids, args)
     envs.close()
     agent.load_state_dict(weights)
@@ -1040,15 +1025,14 @@ def evaluate_run(options: EvaluateArgs) -> dict:
 
 def main(words: list[str]) -> None:
     """Train what the command line says, or evaluate what was trained."""
-    # ours: layers are so small that a second thread waits more than it works
+    # ours: for layers this small a second thread waits more than it works
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 1)))
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        # Freed memory is kept for the next array. Else its pages go back to the system and come
-        # again, cleared: CREATE takes 1.2 times as long, with the paper's minibatches 2.3 times.
+        # Keep freed memory for the next array: else CREATE takes 1.2 (paper: 2.3) times as long.
         libc.mallopt(-1, 2**31 - 1), libc.mallopt(-3, 2**31 - 1)  # M_TRIM_, M_MMAP_THRESHOLD
     if words[:1] == ["evaluate"]:
         return evaluate_run(tyro.cli(EvaluateArgs, args=words[1:]))
-    # Three words decide the defaults, those that --help shows, too: the line is read twice.
+    # Three words decide the defaults, so the line is read twice.
     first = tyro.cli(Args, args=[word for word in words if word not in ("-h", "--help")])
     default = default_args(first.env, first.recipe, first.quick)
     args = tyro.cli(Args, args=words or ["--help"], default=default)
