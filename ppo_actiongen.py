@@ -752,7 +752,7 @@ def train(args: Args) -> dict:
         if is_checkpoint:
             state |= dict(optimizer=optimizer.state_dict(), rewards=reward_stats.state_dict())
             state["progress"] = update_index, seconds, best_score, metrics.tell()
-            state["generators"] = torch.stack(everyone(generator.get_rng_state()))
+            state["generators"] = everyone(generator.get_rng_state())
             if not RANK:
                 hvae.write(folder / "checkpoint.pt", partial(torch.save, state))
             # Episodes start afresh: a resumed run repeats an unbroken one.

@@ -657,6 +657,7 @@ def test_a_run_in_two_processes(tmp_path):
     seen = checkpoint["agent"]["obs_stats.sums"][0, 0].item()
     assert seen == pytest.approx(1536 + 1e-4)  # of both
     assert not torch.equal(*checkpoint["generators"])  # each draws its own noise
+    run(*TORCHRUN, "ppo_actiongen.py", *words(tmp_path, *extra, "--resume"))
 
 
 @pytest.mark.slow
