@@ -5,7 +5,7 @@ and of that action's representation c_i (hvae.py), and takes a softmax over the 
 
     pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
 
-So actions it was never trained on are simply another list of vectors. Three things make that work:
+So actions it was never trained on are simply another list of vectors. This works by three things:
 a random subset of the training actions in every episode, an entropy bonus, and model selection on
 held-out *validation* actions. The test actions are used once, at the end.
 
@@ -376,7 +376,7 @@ class Agent(nn.Module):
         return self.action_project(table) @ W_c.T + self.utility_hidden.bias
 
     def choice_logits(self, code, available, P):
-        """Code (B, H), rows of P on offer (B, K) -> logits (B, K) or, nearest neighbour, (B, n)."""
+        """Code (B, H), rows of P on offer (B, K) -> logits (B, K); nearest neighbour: (B, n)."""
         if self.args.method == "nearest-neighbor":
             return self.head(code)
         if self.args.bilinear:  # (B, 1, D) @ (B, D, K) -> (B, 1, K)
@@ -733,6 +733,8 @@ def train(args: Args) -> dict:
             raise ValueError(f"learning_rate {args.learning_rate} is too high: NaN")
         update_index += 1
         row |= dict(step=update_index * batch_size, learning_rate=lr)
+        # 1: the critic knew every return; 0: it knew no more than their mean.
+        row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
         if episodes := sum(everyone(episodes), []):
             row |= zip(COLUMNS[5:8], np.mean(episodes, 0), strict=True)
 
@@ -871,7 +873,7 @@ def load(path: Path) -> dict:
 
 COLUMNS = (
     "step seconds sps train_score valid_score episode_score episode_return episode_length "
-    "pg_loss v_loss entropy clip_fraction approx_kl learning_rate"
+    "pg_loss v_loss entropy clip_fraction approx_kl learning_rate explained_variance"
 ).split()
 
 
