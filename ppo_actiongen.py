@@ -1,11 +1,11 @@
 """PPO with a policy over changing sets of actions: train, validate, test on unseen actions.
 
-The policy never sees action ids. It scores every action on offer by a shared utility of the state
-and of that action's representation c_i (hvae.py), and takes a softmax over the set A on offer:
+The policy never sees action ids. It scores every action on offer by a shared utility of state and
+representation c_i (hvae.py), and takes a softmax over the set A on offer:
 
     pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
 
-So actions it was never trained on are simply another list of vectors. This works by three things:
+So actions it was never trained on are simply another list of vectors. Three things help:
 a random subset of the training actions in every episode, an entropy bonus, and model selection on
 held-out *validation* actions. The test actions are used once, at the end.
 
@@ -409,7 +409,7 @@ class Agent(nn.Module):
 
         (code, value), new = self.encode(state), action is None
         action = {} if new else action
-        if self.args.method == "continuous":  # published code: softplus is the variance
+        if self.args.method == "continuous":  # published code
             policy = Normal(self.head_mean(code), F.softplus(self.head_var(code)).sqrt())
         else:
             policy = Categorical(logits=self.choice_logits(code, available, P))
