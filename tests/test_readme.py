@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 
 def anchors(text: str) -> set[str]:
-    """The names by which a page's headings can be linked to, made as GitHub makes them."""
+    """The names of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.S), re.M)
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
@@ -45,9 +45,7 @@ def test_every_script_picture_and_heading_they_link_to_exists():
 
 
 def test_tables_equal_the_csv_files():
-    check = [sys.executable, "benchmarks/report.py", "--check"]
-    result = subprocess.run(check, cwd=ROOT, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+    subprocess.run([sys.executable, "benchmarks/report.py", "--check"], cwd=ROOT, check=True)
 
 
 def test_every_figure_and_flag_it_names_is_known():
@@ -66,9 +64,8 @@ def run_example(start: str, name: str, folder: Path, *flags: str) -> None:
     """Save the README's Python example that begins with these words to a file, and run it."""
     (text,) = (t for t in re.findall(r"```python\n(.*?)```", TEXT, re.S) if t.startswith(start))
     (folder / name).write_text(text)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, name, *flags]
-    subprocess.run(command, cwd=folder, env=environment, check=True, timeout=300)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, name, *flags], cwd=folder, env=environment, check=True)
 
 
 def test_example_of_an_own_environment_learns_unseen_actions(tmp_path):
