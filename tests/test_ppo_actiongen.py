@@ -562,9 +562,13 @@ def test_evaluate_writes_one_row_per_question_and_a_gif(finished, tmp_path):
     rows = csv.DictReader((tmp_path / "evaluations.csv").read_text().splitlines())
     asked = [(r["num_available"], r["unseen_ratio"]) for r in rows if 0 <= float(r["score"]) <= 1]
     assert asked == [("10", ""), ("50", ""), ("50", "0.5")] and gif.read_bytes()[:3] == b"GIF"
-    for options in (dict(num_available=300), dict(actions="train", unseen_ratio=0.5)):
+    for options in (
+        dict(num_available=300),
+        dict(actions="train", unseen_ratio=0.5),
+        dict(episodes=0),
+    ):
         with pytest.raises(ValueError):
-            ppo.evaluate_run(ppo.EvaluateArgs(**common, **options))
+            ppo.evaluate_run(ppo.EvaluateArgs(**(common | options)))
 
 
 def test_pools_of_the_analyses():
