@@ -399,7 +399,7 @@ class Agent(nn.Module):
         """Choose, or score what was chosen: CleanRL's `get_action_and_value`.
 
         state (B, ...), rows of P on offer (B, K) -> action, log-probability, entropy, value, each
-        (B,). action: "output" (of the policy), "choice" (the slot that the environment executes),
+        (B,). action: "output" (of the policy), "choice" (the slot that is executed),
         "taken" (its id), "position", "stop".
         """
 
@@ -732,7 +732,6 @@ def train(args: Args) -> dict:
             raise ValueError(f"learning_rate {args.learning_rate} is too high: NaN")
         update_index += 1
         row |= dict(step=update_index * batch_size, learning_rate=lr)
-        # 1: the critic knew every return; 0: it knew no more than their mean.
         row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
         if episodes := sum(everyone(episodes), []):
             row |= zip(COLUMNS[5:8], np.mean(episodes, 0), strict=True)
