@@ -19,7 +19,7 @@ held-out *validation* actions. The test actions are used once, at the end.
 
 Paper map, in the order of this file: Tables 3, 4 -> Args, TABLE_3 (ours: FAST, QUICK); D.3.2 state
 encoder f_omega and critic -> mlp, cnn, Agent.encode; utility f_nu -> utility, Agent.choice_logits;
-auxiliary policy f_chi, C.4 -> position_head, Agent.act; baselines -> Agent.act, Agent.slot;
+auxiliary policy, C.4 -> position_head, Agent.act; baselines -> Agent.act, Agent.slot;
 Algorithm 1 -> rollout, gae, ppo_loss, update, train; Algorithm 2 -> evaluate; A.3 -> restrict_pool.
 
 Shapes: T rollout steps, N environments, B rows of a batch, K actions on offer, D size of a
@@ -632,7 +632,7 @@ def check(args: Args) -> None:
             raise ValueError(f"{name} {value} is too small")
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
-        rule = f"minibatch_size x num_minibatches of num_envs, and both of {WORLD_SIZE} processes"
+        rule = f"minibatch_size x num_minibatches of num_envs, both of {WORLD_SIZE} processes"
         raise ValueError(f"these have to be multiples: {rule}")
     if not 2 <= size <= args.total_timesteps:
         raise ValueError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")

@@ -97,7 +97,6 @@ def test_action_observations_depend_on_the_seed_and_the_action_alone(module):
 
 
 def play(module, seed, steps, n=3):
-    """Observations, rewards, ends and scores of `steps` random steps."""
     pool, rng = module.split_actions()["valid"], np.random.default_rng(0)
     envs = module.make_vec(n, pool, 7, seed)
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
