@@ -621,8 +621,7 @@ def load_table(args: Args) -> np.ndarray:
             print(f"no {path} yet: training the encoder first", flush=True)
             hvae.train(encoder)
     loaded = hvae.load_representation(path, args.env, args.split, args.split_seed)
-    there = loaded["config"]
-    if stale := [k for k in wanted if there.get(k, wanted[k]) != wanted[k]]:
+    if stale := [k for k in wanted if loaded["config"].get(k, wanted[k]) != wanted[k]]:
         raise ValueError(f"{path} has another {stale[0]} than the recipe: delete it")
     return loaded["mean"]
 
@@ -638,7 +637,7 @@ def check(args: Args) -> None:
         raise ValueError(f"these have to be multiples: {rule}")
     if not 2 <= size <= args.total_timesteps:
         raise ValueError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
-    env, nearest, utility = args.env, args.method == "nearest-neighbor", args.method == "utility"
+    env, nearest, is_ours = args.env, args.method == "nearest-neighbor", args.method == "utility"
     learned, default = args.representation in ENCODERS, default_args(env, args.recipe, args.quick)
     one_set = nearest or args.adapt or not args.subsample
     effects = {  # flags: whether they change anything; a run is named after them
@@ -656,8 +655,8 @@ def check(args: Args) -> None:
         "aux_conditioned": env == "create" or args.placement in ("1d", "2d"),
         "one_hot": env not in ("recsys", "create", "stacking"),  # states of integers
         "ink": env not in ("gridworld", "recsys"),  # pictures
-        "bilinear": utility,
-        "small_gains": utility and not args.bilinear or args.aux_conditioned,
+        "bilinear": is_ours,
+        "small_gains": is_ours and not args.bilinear or args.aux_conditioned,
     }
     for flags, has_effect in effects.items():
         for flag in flags.split() if not has_effect else ():
@@ -753,7 +752,7 @@ def train(args: Args) -> dict:
         if is_checkpoint:
             state |= dict(optimizer=optimizer.state_dict(), rewards=reward_stats.state_dict())
             state["progress"] = update_index, seconds, best_score, metrics.tell()
-            state["generators"] = torch.stack(everyone(generator.get_rng_state()))
+            state["generators"] = everyone(generator.get_rng_state())
             if not RANK:
                 hvae.write(folder / "checkpoint.pt", partial(torch.save, state))
             # Episodes start afresh: a resumed run repeats an unbroken one.
@@ -999,6 +998,8 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     args, weights, stream = best["args"], best["agent"], (options.seed, 5)
     phases, train_ids = action_pools(args)
     pool, K = phases["train" if args.adapt else options.actions]  # adapted: to the test actions
+    if options.episodes < 1:
+        raise ValueError(f"episodes {options.episodes} is too small")
     pool = restrict_pool(options, weights["table"], pool, phases["learn"][0])
     offer = pool, options.num_available or min(K, len(pool))
     envs = make_envs(args, pool, 1, offer[1], *stream)
