@@ -162,7 +162,8 @@ def table(figure: str, cells: Cells) -> str:
     phases = sorted(phases, key=lambda phase: [*HEADS, phase].index(phase))  # seen, unseen, others
     lines = []
     for (place, method), cell in cells.items():
-        line = [title(place) * (len(places(cells)) > 1), METHODS[method][0], steps(place)]
+        named = len(places(cells)) > 1 or figure == "main"
+        line = [title(place) * named, METHODS[method][0], steps(place)]
         line.append(str(max(map(len, cell.values()))))
         for phase in phases:
             theirs = cell.get(f"{phase}, published") or published(figure, place, method, phase)
