@@ -5,9 +5,8 @@ representation c_i (hvae.py), and takes a softmax over the set A on offer:
 
     pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
 
-So actions it was never trained on are simply another list of vectors. Three things help:
-a random subset of the training actions in every episode, an entropy bonus, and model selection on
-held-out *validation* actions. The test actions are used once, at the end.
+So new actions are simply another list of vectors. Three things help: a random subset of the
+training actions in every episode, an entropy bonus, and selection on held-out *validation* actions.
 
     python ppo_actiongen.py gridworld --quick         # the whole protocol in minutes
     python ppo_actiongen.py gridworld                 # or: recsys, create, stacking
@@ -161,13 +160,15 @@ FAST = {
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         small_gains=False,
         hidden_size=256,  # which tool, and where: more to know
-        minibatch_size=256,  # rollouts of 1,024 steps: from pictures, longer ones learn later
+        minibatch_size=128,
+        num_minibatches=16,
+        update_epochs=1,  # seen twice, pictures are learned by heart: first by the critic
         learning_rate=5e-4,
         clip_coef=0.2,  # goals are rare: let each one teach more
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions are the critic's
         clip_vloss=False,  # ... and clipped steps are too small for it
         total_timesteps=4_000_000,
-        eval_every=205_000,
+        eval_every=102_400,
     ),
     "stacking": dict(
         small_gains=False,
@@ -304,8 +305,7 @@ class Utility(torch.autograd.Function):
 class Agent(nn.Module):
     """The policy and the critic of D.3.2, or a baseline's policy.
 
-    `table` (A, D): a representation per action, never trained by RL. `train_ids` (n,), sorted: the
-    actions on offer in training. The nearest-neighbour baseline has an output for each of them.
+    `table` (A, D): a representation per action, fixed. `train_ids` (n,): those of training, sorted.
     """
 
     def __init__(self, envs: VectorEnv, table, train_ids, args: Args):
