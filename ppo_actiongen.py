@@ -702,7 +702,7 @@ def train(args: Args) -> dict:
     eval_every = max(1, args.eval_every // batch_size)  # in updates
     decay_updates = max(1, (args.lr_decay_steps or args.total_timesteps) // batch_size)
     metrics = io.StringIO() if RANK else open(folder / "metrics.csv", "a", buffering=1)
-    metrics.truncate(size)  # what came after the checkpoint is made again
+    metrics.seek(metrics.truncate(size))  # what came after the checkpoint is made again
     writer = None if RANK else SummaryWriter(folder, purge_step=update_index * batch_size)
     obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
     while update_index < num_updates:

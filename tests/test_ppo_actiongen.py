@@ -387,16 +387,16 @@ def test_one_seed_gives_one_run_and_its_command_can_be_pasted(finished, tmp_path
     assert shlex.split(command) == ["python", "ppo_actiongen.py", *line]
 
 
-def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path):
+@pytest.mark.parametrize("rows", [1, 7])  # before the first checkpoint, and after it
+def test_a_killed_and_resumed_run_equals_one_never_killed(finished, tmp_path, rows):
     command = [sys.executable, "ppo_actiongen.py", *words(tmp_path)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     metrics, deadline = tmp_path / "run" / "metrics.csv", time.time() + 120
     while time.time() < deadline and process.poll() is None:
-        if metrics.exists() and len(metrics.read_text().splitlines()) > 7:
+        if metrics.exists() and len(metrics.read_text().splitlines()) > rows:
             break
         time.sleep(0.002)
-    process.kill()
-    process.wait()
+    process.kill(), process.wait()
     assert not (tmp_path / "run" / "results.json").exists()
     ppo.main(words(tmp_path, "--resume"))
     assert_same_run(finished[0], tmp_path / "run")
