@@ -68,6 +68,8 @@ OBSERVATIONS_VERSION = 1  # ours: raise it when an environment records something
 
 
 # ---- Tables 3 and 4 ----
+
+
 @dataclass(kw_only=True)
 class Args:
     """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
@@ -128,15 +130,13 @@ LAPTOP_OF = {  # an environment or a modality
     "gridworld": dict(updates=1_000),  # with the linear path: see ActionInference
     "onehot": dict(updates=4_000),  # 160 zeros and ones say the same as 2 numbers, learned later
     "create": BALLS | dict(updates=2_500),
-    # At 1/1,024 it is cheaper to write the poses of the 4 pictures into c than into z: draw_noise
-    # 1.2, nn_class .25. At 1/4 c costs what z does, and is left with the shape: .27, .75.
-    "image": PICTURES | dict(updates=1_000, set_size=4),
+    "image": PICTURES | dict(updates=1_500),
     "video": PICTURES | dict(updates=600, observations=128),  # 1,024 of every tool are 28 GB
 }
 QUICK_OF = {  # as many observations as a minute of recording allows
     "onehot": dict(updates=2_000),
     "create": dict(updates=1_250, observations=128),
-    "image": dict(observations=64),
+    "image": dict(updates=1_000, observations=64),
     "video": dict(updates=200, observations=16),
 }
 
