@@ -6,8 +6,8 @@
 A table and its picture go between `<!-- begin:NAME -->` and `<!-- end:NAME -->`, where NAME is a
 figure of benchmarks/paper.py, `<figure>-paper` for --recipe paper, `main` (the summary) or `fig14`
 (all learning curves). A page has the markers it wants; what has no results stays empty.
-Each environment is shown at one number of steps, the one most rows of the figure have. Methods
-within two standard errors of random play are not in the table, but in one line below it.
+A picture shows each environment at one number of steps, the one most rows of the figure have.
+Methods within two standard errors of random play are not in the table, but in one line below it.
 """
 
 import io
@@ -92,22 +92,22 @@ def tested(phase: str) -> float:
     return float(found[1]) if found else 0.0
 
 
-def group(rows: list[dict], phase: str = "phase", column: str = "score") -> Cells:
+def group(rows: list[dict], phase="phase", column="score", every=False) -> Cells:
     """A column's numbers by place, method and phase (or another column), in the order of METHODS.
 
-    Of each environment only one number of steps: the one of most rows, then the largest.
+    Unless `every`, only one number of steps of an environment: that of most rows, then the largest.
     """
     usual: dict[str, tuple] = {}
     for (env, steps), n in Counter((row["env"], int(row["steps"] or 0)) for row in rows).items():
         usual[env] = max(usual.get(env, (0, 0)), (n, steps))
     cells: Cells = defaultdict(lambda: defaultdict(list))
     for row in sorted(rows, key=lambda row: tested(row[phase])):
-        if int(row["steps"] or 0) == usual[row["env"]][1] and row[column]:
-            place = row["env"], row["task"], usual[row["env"]][1]
+        place = row["env"], row["task"], int(row["steps"] or 0)
+        if row[column] and (every or place[2] == usual[row["env"]][1]):
             cells[place, row["method"]][row[phase]].append(float(row[column]))
     tasks, methods = [*dict.fromkeys((row["env"], row["task"]) for row in rows)], [*METHODS]
-    keys = sorted(cells, key=lambda key: (tasks.index(key[0][:2]), methods.index(key[1])))
-    return {key: cells[key] for key in keys}
+    order = {k: (tasks.index(k[0][:2]), methods.index(k[1]), k[0][2]) for k in cells}
+    return {key: cells[key] for key in sorted(cells, key=order.get)}
 
 
 def places(cells: Cells) -> list[Place]:
@@ -162,7 +162,7 @@ def table(figure: str, cells: Cells) -> str:
     phases = sorted(phases, key=lambda phase: [*HEADS, phase].index(phase))  # seen, unseen, others
     lines = []
     for (place, method), cell in cells.items():
-        named = len(places(cells)) > 1 or figure == "main"
+        named = len({place[:2] for place in places(cells)}) > 1 or figure == "main"
         line = [title(place) * named, METHODS[method][0], steps(place)]
         line.append(str(max(map(len, cell.values()))))
         for phase in phases:
@@ -295,11 +295,11 @@ def section(name: str, draw: bool) -> str:
         text, picture = table(name, group(rows)), None
     else:
         rows = [row for row in rows if row["phase"] != "valid"]
-        cells = group(rows)
-        notes = drop_not_learned(cells, group(rows, column="stderr"))
+        cells = group(rows, every=True)
+        notes = drop_not_learned(cells, group(rows, column="stderr", every=True))
         some = {k: cell for k, cell in cells.items() if k[1] in SHOWN.get(name, METHODS)}
-        text, drawn = table(name, some), cells and name not in ("main", "quick")
-        picture = partial(draw_bars, path, cells) if drawn else None
+        text, bars = table(name, some), {k: cells[k] for k in group(rows) if k in cells}
+        picture = partial(draw_bars, path, bars) if bars and name not in ("main", "quick") else None
     if draw and picture:
         with matplotlib.rc_context(LOOK):
             picture()

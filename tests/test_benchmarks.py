@@ -92,7 +92,7 @@ def test_merging_replaces_a_row_and_sorts_numbers_by_size(tmp_path):
         assert made == [("9", "1"), ("10", str(score))]
 
 
-def test_a_page_shows_one_budget_and_one_line_on_what_is_not_learned(tmp_path, monkeypatch):
+def test_a_table_shows_every_budget_and_one_line_on_what_is_not_learned(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "RESULTS", tmp_path)
     assert {report.section(name, True) for name in [*paper.TABLE, "main", "fig14"]} == {""}
     rows = [("ours", 0.7, 10**7), ("ours", 0.9, 10**7), ("engineered", 0.5, 10**7)]
@@ -107,7 +107,7 @@ def test_a_page_shows_one_budget_and_one_line_on_what_is_not_learned(tmp_path, m
     report.main(check=True)
     text = page.read_text()
     assert "|Ours|10M|2|0.800±0.100 (0.904)|0.800±0.100 (0.703)|1.000|\n" in text
-    assert "(random play: 0.003): Continuous output.\n" in text and "|1M" not in text
+    assert "(random play: 0.003): Continuous output.\n" in text and "|Ours|1M|1|0.200" in text
     assert text.endswith("![gridworld](gridworld.png)\n<!-- end:gridworld -->\nb\n")
     assert (tmp_path / "gridworld.png").exists()
 
