@@ -316,11 +316,11 @@ class ActionInference(nn.Module):
     def forward(self, h):
         pooled = self.before(h).mean(1)  # (A, n, width) -> (A, width), whatever the order and n
         out = self.after(pooled)  # (A, 2C)
-        # Linear path, ours, in Grid World's short recipes: the mean of c is a linear map of the
-        # averaged observations plus 0.1 of the networks. Networks may put every training skill
-        # anywhere; a linear map that tells their moves apart does so for unseen skills, too.
-        # Validation success of one policy after 1.5M steps, seeds and splits 0, 1, 2: with the path
-        # 0.877, 0.851, 0.796; without it 0.847, 0.752, 0.699 (after 2,750 updates, not 1,000).
+        # Linear path, ours, in two short recipes: the mean of c is a linear map of the averaged
+        # observations (of pictures: convolved) plus 0.1 of the networks, which by themselves may
+        # put a training action anywhere. Shape Stacking, nn_class, seeds 0, 1: 0.914, 0.923;
+        # without 0.254, 0.612. Grid World, validation after 1.5M steps, seeds and splits 0, 1, 2:
+        # 0.877, 0.851, 0.796; without 0.847, 0.752, 0.699 (after 2,750 updates, not 1,000).
         if self.linear:
             straight = self.linear(h[..., -self.linear.in_features :].mean(1))  # (A, C)
             out = 0.1 * out + F.pad(straight, (0, straight.shape[1]))
@@ -419,8 +419,7 @@ class ObservationModel(nn.Module):
             features = shape[-1] * (CLASSES if args.modality == "onehot" else 1)
             sigmas = (features,)
         if picture:
-            # appendix: Bi-LSTM for trajectories only; published code: pictures pass it as sequences
-            # of length 1; we do as the appendix.
+            # appendix: Bi-LSTM of trajectories only; published code: of all; we do as the appendix.
             self.sequence = nn.Sequential(nn.Flatten(), nn.Linear(features, hidden), nn.ReLU())
         else:
             self.sequence = TrajectoryEncoder(features, hidden, compact=args.recipe != "paper")
@@ -478,8 +477,9 @@ class HVAE(ObservationModel):
     def __init__(self, args, shape):
         size, hidden = args.representation_size, args.hidden
         super().__init__(args, shape, latents=(size, size))
-        if args.env == "gridworld" and args.modality == "xy" and args.recipe != "paper":
-            self.numbers = shape[0] * shape[1]
+        if args.recipe != "paper":
+            linear = {"gridworld-xy": shape[0] * shape[1], "stacking-image": CONV_FEATURES}
+            self.numbers = linear.get(f"{args.env}-{args.modality}", 0)
         self.q_c = ActionInference(hidden + self.numbers, args.q_hidden, size, self.numbers)
         self.q_z = ObservationInference((hidden + self.numbers, size), hidden, size)
         self.p_z = ObservationInference((size,), hidden, size)

@@ -127,15 +127,15 @@ def test_batch_norm_is_global_and_the_linear_path_a_map_of_averaged_observations
     expected = (x - x.mean()) / (x.var(correction=0) + 1e-3).sqrt()
     torch.testing.assert_close(hvae.GlobalBatchNorm()(x), expected, rtol=1e-4, atol=1e-5)
     model, raw = small("xy")
-    model.eval()
     with torch.no_grad():
         model.q_c.after[-1].weight.zero_()  # the networks' share
         inputs, _ = hvae.prepare(raw.flatten(0, 1), model.args)
-        mean = model.represent(model.encode(inputs)[1].unflatten(0, (3, 2)))
+        mean = model.eval().represent(model.encode(inputs)[1].unflatten(0, (3, 2)))
         average = inputs.flatten(1).unflatten(0, (3, 2)).mean(1)  # (3, 12)
         expected = model.q_c.linear(average) / (1 + 1e-3) ** 0.5  # a new batch norm
     torch.testing.assert_close(mean, expected)
-    assert small("onehot")[0].q_c.linear is None  # and in no other modality or environment
+    picture = HVAE(arguments("image", env="stacking"), (84, 84))
+    assert picture.q_c.linear.in_features == 288 and small("onehot")[0].q_c.linear is None
 
 
 def test_targets_and_inputs_undone_are_the_states():
