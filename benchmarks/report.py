@@ -274,8 +274,8 @@ def section(name: str, draw: bool) -> str:
     if not rows:
         return ""
     if name == "fig14":
-        seen, valid = (group(rows, "step", f"{phase}_score") for phase in ("train", "valid"))
-        panels, grey = {}, dict(color="0.5", ls="--")
+        seen, valid = (group(rows, "step", f"{phase}_score", True) for phase in ("train", "valid"))
+        panels, grey = {}, dict(color="0.5", ls="--")  # a method's longest runs come last, and stay
         for (place, method), points in valid.items():
             lines = [("training actions", seen[place, method], grey)]
             lines.append(("validation actions", points, dict(color=METHODS[method][1])))
