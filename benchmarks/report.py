@@ -6,7 +6,7 @@
 A table and its picture go between `<!-- begin:NAME -->` and `<!-- end:NAME -->`, where NAME is a
 figure of benchmarks/paper.py, `<figure>-paper` for --recipe paper, `main` (the summary) or `fig14`
 (all learning curves). A page has the markers it wants; what has no results stays empty.
-A picture shows each environment at one number of steps, the one most rows of the figure have.
+A picture shows each environment at one number of steps, the one most methods of the figure have.
 Methods within two standard errors of random play are not in the table, but in one line below it.
 """
 
@@ -93,12 +93,11 @@ def tested(phase: str) -> float:
 
 
 def group(rows: list[dict], phase="phase", column="score", every=False) -> Cells:
-    """A column's numbers by place, method and phase (or another column), in the order of METHODS.
-
-    Unless `every`, only one number of steps of an environment: that of most rows, then the largest.
-    """
+    """A column's numbers by place, method, phase (or another column), in the order of METHODS."""
+    # Unless `every`, one number of steps per environment: that of most methods, or the largest.
     usual: dict[str, tuple] = {}
-    for (env, steps), n in Counter((row["env"], int(row["steps"] or 0)) for row in rows).items():
+    runs = {(row["env"], int(row["steps"] or 0), row["method"]) for row in rows}
+    for (env, steps), n in Counter(run[:2] for run in runs).items():
         usual[env] = max(usual.get(env, (0, 0)), (n, steps))
     cells: Cells = defaultdict(lambda: defaultdict(list))
     for row in sorted(rows, key=lambda row: tested(row[phase])):
@@ -289,7 +288,7 @@ def section(name: str, draw: bool) -> str:
         picture = partial(draw_lines, path, lines_of(name, curves, zero), "million steps")
         text = "Success with unseen actions over steps of training on them."
     elif name in ANALYSES:
-        text, lines = table(name, group(rows)), lines_of(name, group(rows), {})
+        text, lines = table(name, group(rows, every=True)), lines_of(name, group(rows), {})
         picture = partial(draw_lines, path, lines, ANALYSES[name][1])
     elif figure in ("fig4", "fig5", "fig6"):  # t-SNE by hvae.py, one picture per encoder
         text, picture = table(name, group(rows)), None
