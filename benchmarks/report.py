@@ -234,7 +234,8 @@ def draw_lines(
     path: Path, panels: dict[str, list[tuple]], xlabel: str, columns=3, width=3.1
 ) -> None:
     """Panels of (label, {phase or step: its seeds}, look): mean and standard deviation."""
-    figure, axes = canvas(len(panels), columns, width, 0.3 + 0.7 * width)
+    least = 6.5 / len(panels)  # room for the legend
+    figure, axes = canvas(len(panels), columns, max(width, least), 0.3 + 0.7 * width)
     key = {}
     for axis, (name, some) in zip(axes, panels.items(), strict=True):
         for label, phases, look in some:
