@@ -149,6 +149,7 @@ FAST = {
     ),
     "recsys": dict(
         bilinear=True,  # an MLP learns single products by heart
+        hidden_size=256,  # 64 miss more of the taste: validation .263, not .280
         gamma=0.0,  # later clicks only drown the one that was earned
         minibatch_size=512,
         num_available=100,  # a fifth of the cost of a step
@@ -523,8 +524,7 @@ def update(agent: Agent, optimizer, batch: dict, ent_coef: float, args: Args) ->
     row = torch.zeros(len(agent.table), dtype=torch.int64, device=agent.table.device)
     row[agent.train_ids] = torch.arange(len(agent.train_ids), device=row.device)
     b["available"] = row[b["available"]]  # (T * N, K)
-    # published code: normalised once, over the whole rollout
-    everyones = torch.cat(everyone(b["advantage"]))
+    everyones = torch.cat(everyone(b["advantage"]))  # published code: of the whole rollout
     b["advantage"] = (b["advantage"] - everyones.mean()) / (everyones.std() + 1e-5)
     size, parameters = args.minibatch_size // WORLD_SIZE, list(agent.parameters())
     for _ in range(args.update_epochs):
