@@ -217,15 +217,17 @@ def mlp(inputs: int, H: int) -> nn.Sequential:
 
 def cnn(frames: int, H: int, ink: bool) -> nn.Sequential:
     """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU."""
-    # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side; ink starts at 42
-    channels, layers = [frames, 16, *[16] * (not ink), 32, 32, 32], []
+    # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side
+    channels, features, layers = [frames, 16, 16, 32, 32, 32], 32 * 3 * 3, []
+    if ink:  # 42 -> 21 -> 11 -> 6: on 3 x 3 pixels is little of where a ball is
+        channels, features = [frames, 16, 32, 64], 64 * 6 * 6
     for into, out in pairwise(channels):
         conv = nn.Conv2d(into, out, 3, stride=2, padding=1)
         # published code: PyTorch's own weights; they hide what differs between pictures
         layers += [layer_init(conv) if ink else conv, nn.ReLU()]
-    # (B, 32, 3, 3) -> (B, 288); ink, few lines on the picture or many: features of one size
-    layers += [nn.Flatten(), *[nn.LayerNorm(288, elementwise_affine=False)] * ink]
-    return nn.Sequential(*layers, layer_init(nn.Linear(288, H)), nn.ReLU())
+    # (B, C, h, w) -> (B, C h w); ink, few lines on the picture or many: features of one size
+    layers += [nn.Flatten(), *[nn.LayerNorm(features, elementwise_affine=False)] * ink]
+    return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
 
 def position_head(H: int, d: int, args: Args) -> nn.Module:
