@@ -216,7 +216,7 @@ def mlp(inputs: int, H: int) -> nn.Sequential:
 def cnn(frames: int, H: int, ink: bool) -> nn.Sequential:
     """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU."""
     # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side. Ink: 42 -> 21 -> 11 -> 6. From
-    # 3 x 3 the code knows less well where the balls are: push, 4M steps, validation .65, not .75.
+    # 3 x 3 the code knows less well where the balls are: push, 4M steps, validation .64, not .75.
     channels, side = ([frames, 16, 32, 64], 6) if ink else ([frames, 16, 16, 32, 32, 32], 3)
     layers, features = [], channels[-1] * side**2
     for into, out in pairwise(channels):
