@@ -979,11 +979,11 @@ def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
         create_env = hvae.load_environment("create")  # no other actions have angles
         pool = pool[create_env.angle_gaps(pool, known) >= gap]
     if distance is not None:
-        squared = torch.cdist(table[pool].double(), table[known].double()).amin(1).square()
+        squared = torch.cdist(table[pool].double(), table[known].double()).amin(1).square().numpy()
         # published: absolute distances, which depend on the encoder
         least = float(distance.removeprefix("q"))
-        least = float(squared.quantile(least)) if distance[0] == "q" else least
-        pool = pool[squared.numpy() >= least]
+        least = np.quantile(squared, least) if distance[0] == "q" else least
+        pool = pool[squared >= least]
     if ratio is not None:  # of two pools of one size, so that it is that of what is on offer
         rng, size = np.random.default_rng(options.seed), min(len(pool), len(known))
         count = round(ratio * size)

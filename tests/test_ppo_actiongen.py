@@ -590,8 +590,8 @@ def test_pools_of_the_analyses():
         mixed = pool(unseen_ratio=ratio)
         assert len(np.unique(mixed)) == len(mixed)
         assert np.isin(mixed, test).mean() == pytest.approx(ratio, abs=0.001)
-    with pytest.raises(ValueError):
-        pool(min_embedding_distance="far")
+    for wrong in ("far", "", "q1.5"):
+        pytest.raises(ValueError, pool, min_embedding_distance=wrong)
 
 
 @pytest.mark.parametrize("method", ["utility", "nearest-neighbor"])
