@@ -628,8 +628,8 @@ def load_table(args: Args) -> np.ndarray:
 def check(args: Args) -> None:
     """Refuse, before anything is made, what cannot be trained or has no effect."""
     for name, value in vars(args).items():
-        if type(value) is int and value < (0 if "seed" in name else 1):
-            raise ValueError(f"{name} {value} is too small")
+        if type(value) is int and value < (0 if "seed" in name else 1) or value != value:
+            raise ValueError(f"{name} cannot be {value}")
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
         rule = f"minibatch_size x num_minibatches of num_envs, both of {WORLD_SIZE} processes"
@@ -999,9 +999,9 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     phases, train_ids = action_pools(args)
     pool, K = phases["train" if args.adapt else options.actions]  # adapted: to the test actions
     if options.episodes < 1:
-        raise ValueError(f"episodes {options.episodes} is too small")
+        raise ValueError(f"episodes cannot be {options.episodes}")
     pool = restrict_pool(options, weights["table"], pool, phases["learn"][0])
-    offer = pool, options.num_available or min(K, len(pool))
+    offer = pool, min(K, len(pool)) if options.num_available is None else options.num_available
     envs = make_envs(args, pool, 1, offer[1], *stream)
     agent = Agent(envs, weights["table"].numpy(), train_ids, args)
     envs.close()

@@ -431,7 +431,8 @@ def test_a_run_that_diverges_says_so(tmp_path):
 
 
 # ---- options ----
-REFUSED = """gridworld --num-available 0; num_available 0 is too small
+REFUSED = """gridworld --num-available 0; num_available cannot be 0
+gridworld --gamma nan; gamma cannot be nan
 gridworld --num-available 600; 600 on offer out of 512
 gridworld --eval-available 300; 300 on offer out of 256
 gridworld --total-timesteps 10; one rollout takes 2048
@@ -562,11 +563,8 @@ def test_evaluate_writes_one_row_per_question_and_a_gif(finished, tmp_path):
     rows = csv.DictReader((tmp_path / "evaluations.csv").read_text().splitlines())
     asked = [(r["num_available"], r["unseen_ratio"]) for r in rows if 0 <= float(r["score"]) <= 1]
     assert asked == [("10", ""), ("50", ""), ("50", "0.5")] and gif.read_bytes()[:3] == b"GIF"
-    for options in (
-        dict(num_available=300),
-        dict(actions="train", unseen_ratio=0.5),
-        dict(episodes=0),
-    ):
+    refused = dict(num_available=0), dict(num_available=300), dict(episodes=0)
+    for options in (*refused, dict(actions="train", unseen_ratio=0.5)):
         with pytest.raises(ValueError):
             ppo.evaluate_run(ppo.EvaluateArgs(**(common | options)))
 
