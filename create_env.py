@@ -81,7 +81,7 @@ LAMBDA_OVERLAP = -0.01  # Eq. 3
 
 MIN_TOOL_GAP = 0.3  # published code, norm: tool centres this close "overlap"
 STILL_SPEED = 0.05  # published code, units/s: slower than this is "not moving"
-STILL_ACTIONS = 2  # published code: so many action ends without motion, in a row or not, are "over"
+STILL_ACTIONS = 2  # published code: so many actions that end without motion are the end
 HIT_DISTANCE = 0.03  # published code, share of the screen's diagonal: then the target counts as hit
 PICTURE_EVERY = 8  # ours, physics steps: 5 colour pictures per action
 
@@ -599,7 +599,7 @@ def build(tool: Tool, x: float, y: float, static_body: pymunk.Body) -> Thing:
     else:
         shape = pymunk.Poly(body, thing.corners)
     shape.collision_type, shape.sensor = int(kind.contact), kind.contact >= Contact.GOAL
-    # The contact law multiplies both numbers of the two shapes; a ball's are 1.
+    # The contact law multiplies both numbers of the two shapes; of most balls 1.
     shape.elasticity = VESSEL_ELASTICITY if family == "vessel" else float(tool.elasticity)
     # published code: never sets the friction of ball tools and planks, which leaves it at 0
     shape.friction = 0.0 if family in ("disc", "plank") else 1.0
@@ -962,8 +962,8 @@ class CreateEnv(gym.Env):
     ## Arguments
     `action_pool` ids (default: training split; the no-op may be among them), `num_available` K,
     `task` one of `TASKS`, `subgoal_reward=False` pays neither subgoals nor target hit (C.3),
-    `render_size` pixels of the colour picture. Bad arguments and bad actions raise ValueError and
-    change nothing.
+    `render_size` pixels of the colour picture. What does not exist of these, and bad actions, raise
+    ValueError and change nothing.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
@@ -1242,7 +1242,7 @@ def action_observations(action_ids, num_observations, modality="xy", seed=0, wor
     """
     ids, shapes = check_ids(action_ids), {"xy": (2,), "state": (6,), "video": (PROBE_VIDEO,) * 2}
     if modality not in shapes or num_observations < 1:
-        raise ValueError(f"{modality!r} is not one of {MODALITIES}, or n is below 1")
+        raise ValueError(f"modality {modality!r} is not one of {MODALITIES}, or n is below 1")
     shape = (len(ids), num_observations, PROBE_LENGTH, *shapes[modality])
     result = np.empty(shape, np.uint8 if modality == "video" else np.float32)
     job = functools.partial(_record, num_observations, modality, seed)
@@ -1411,7 +1411,8 @@ def probe_sheet(name: str) -> Image.Image:
     members = np.flatnonzero((np.char.lower(labels) == name.lower()) & IS_COARSE)
     if not (name.isdecimal() or len(members)):
         raise ValueError(f"unknown tool {name!r}; classes: {', '.join(sorted(set(labels)))}")
-    ids = [int(name)] if name.isdecimal() else members[[len(members) * k // 10 for k in (1, 5, 9)]]
+    some = np.unique(len(members) * np.array([1, 5, 9]) // 10)  # a class may have one member
+    ids = [int(name)] if name.isdecimal() else members[some]
     for states, action in zip(action_observations(ids, 40, "state"), ids, strict=True):
         canvas = Canvas(420, colour=True)
         for k, path in enumerate(to_units(states[..., 2:4] - states[..., :2]).tolist()):
@@ -1490,18 +1491,22 @@ class Args:
 
 def main(args: Args) -> None:
     """Draw what was asked for and say where it is."""
+    if args.tries < 1:
+        raise ValueError(f"tries is {args.tries}, at least 1")
     env = CreateEnv(task=args.task, render_mode="rgb_array")
     if args.play:
         return play(env, args.seed)
     sheets = {"tasks": tasks_sheet} if args.all_tasks else {}
     sheets |= {"tools": tools_sheet} if args.show_tools else {}
     sheets |= {"probe": functools.partial(probe_sheet, args.show_probe)} if args.show_probe else {}
-    args.out.mkdir(parents=True, exist_ok=True)
     for name, draw in sheets.items():
-        draw().save(args.out / f"create_{name}.png")
-        print(f"wrote {args.out / f'create_{name}.png'}")
+        picture, path = draw(), args.out / f"create_{name}.png"
+        args.out.mkdir(parents=True, exist_ok=True)
+        picture.save(temporary := path.with_suffix(f".{os.getpid()}.tmp"), "PNG")
+        temporary.replace(path)
+        print(f"wrote {path}")
     if not sheets:
-        seeds, blind = range(args.seed, args.seed + max(1, args.tries)), CreateEnv(task=args.task)
+        seeds, blind = range(args.seed, args.seed + args.tries), CreateEnv(task=args.task)
         best = max(seeds, key=lambda seed: play_episode(blind, seed)[1])
         frames, total = play_episode(env, best)
         path = args.out / f"create_{args.task}.gif"

@@ -83,7 +83,7 @@ def action_labels() -> np.ndarray:
     east, south = MOVE_DELTAS[SKILL_MOVES].sum(1).T  # (1024,) each
     # Five is odd, so no skill ends where it began. A half axis belongs to the quadrant that follows
     # it against the clock (published code): due east is upper right, due north is upper left.
-    turns = np.arctan2(-south, east) // (np.pi / 2)  # -2..1 quarter turns against the clock
+    turns = np.arctan2(-south, east) // (np.pi / 2)  # -2..2 quarter turns, 2 is -2
     return np.array(list(QUADRANTS))[turns.astype(int)]
 
 
@@ -95,7 +95,7 @@ def engineered_representations(variant: str = "12d") -> np.ndarray:
     "path": (x, y) from the start after each of the five moves, d = 10.
     """
     # appendix: 5-d; published code: 12-d, signs flipped; we default to 12-d, because the published
-    # score was reached with it and move ids have no order. A network cannot tell our signs apart.
+    # score was reached with it and move ids have no order. To a network our signs are the same.
     deltas = MOVE_DELTAS[SKILL_MOVES]  # (1024, 5, 2)
     tables = {
         "12d": np.column_stack([deltas.sum(1), deltas.reshape(-1, 10)]),
@@ -217,14 +217,14 @@ class GridWorldEnv(gym.Env):
         """Draw a layout and the skills on offer; returns (observation, {})."""
         super().reset(seed=None if seed is None else operator.index(seed))  # numpy integers, too
         drawn = self.np_random.integers(len(LAYOUTS))
-        self.layout = operator.index((options or {}).get("layout", drawn))
-        if self.layout not in range(len(LAYOUTS)):
-            raise ValueError(f"layout is {self.layout}; there are 0..{len(LAYOUTS) - 1}")
+        layout = operator.index((options or {}).get("layout", drawn))
+        if layout not in range(len(LAYOUTS)):
+            raise ValueError(f"layout is {layout}; there are 0..{len(LAYOUTS) - 1}")
         # published code: draws sets from the system's entropy; ours: from the seeded generator.
         self.available = pool = self.action_pool  # all of them: a position keeps its meaning
         if self.num_available < len(pool):
             self.available = self.np_random.choice(pool, self.num_available, replace=False)
-        self.grid = LAYOUTS[self.layout].tolist()  # plain integers, without the agent
+        self.layout, self.grid = layout, LAYOUTS[layout].tolist()  # integers, without the agent
         self.trace, self.skill, self.moves = [START], None, 0
         self.subgoal_taken = self.over = False
         return self._observe(), {}
@@ -302,10 +302,12 @@ def action_observations(action_ids, num_observations=1024, modality="xy", seed=0
     "onehot" is the same numbers: the encoder expands them to 80 + 80 zeros and ones per state.
 
     A skill's recordings depend on (seed, id) only. `workers` is ignored: all takes a second.
-    ValueError for ids that are unknown or repeated and for an unknown modality.
+    ValueError for ids that are unknown or repeated, an unknown modality, no observations.
     """
     if modality not in MODALITIES:
         raise ValueError(f"modality {modality!r} is unknown; there are {', '.join(MODALITIES)}")
+    if num_observations < 1:
+        raise ValueError(f"num_observations is {num_observations}, at least 1")
     action_ids = check_ids(action_ids)
     paths = np.empty((len(action_ids), num_observations, SKILL_LENGTH + 1, 2), np.int8)
     for i, action in enumerate(action_ids):

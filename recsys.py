@@ -54,7 +54,7 @@ MAX_RECOMMENDATIONS = 100  # A.2, Table 3 "max. episode length"
 EQ_2 = (14.0, 2.0, 0.3, 2.0, 6.0)  # a, b, c, d, e of Eq. 2; this c is not a product
 SIGMA_1 = 0.1  # A.2: scale of one perturbation of the user
 MU_STD = 3.0  # published code; the appendix does not say how mu_i is distributed
-ORGANIC, BANDIT, GONE = range(3)  # A.2 names the first two and "terminates stochastically"
+ORGANIC, BANDIT, GONE = range(3)  # A.2 names the first two; in the last the user has left
 PAGE_VIEW = -1  # in place of a product id: the user looks at something unknown
 # Published code; the appendix gives no numbers. Rows: now, columns: next.
 TRANSITIONS = np.array([[0.74, 0.25, 0.01], [0.05, 0.94, 0.01], [0.0, 0.0, 1.0]])
@@ -63,8 +63,8 @@ CUMULATIVE = TRANSITIONS.cumsum(1)  # (3, 3), for drawing the next session
 # ---- A.2 Actions: the products, drawn once for every environment, seed and method ----
 
 # A key of nine words, which no seed of an environment has: no user is drawn like a product. ours:
-# 21 is the first that brings the mean mu of training, validation and test products within 0.03 of 0
-# (the ceilings depend on it). [key, 0] would not do: it is the same stream as plain key.
+# 21 is the first that brings the mean mu of training, validation and test products (split 0)
+# within 0.03 of 0 (the ceilings depend on it).
 _rng = np.random.default_rng([*b"products", 21])
 PRODUCTS = _rng.standard_normal((NUM_ACTIONS, DIM))  # c_i
 # appendix: c ~ N(0, I), length about 4; published code: scaled to length 1; we do the latter,
@@ -210,10 +210,10 @@ class RecSysEnv(gym.Env):
         """Recommend one product; returns (observation, reward, terminated, truncated, info)."""
         if self.ending:
             raise gym.error.ResetNeeded("call reset() before step()")
-        if not 0 <= action < self.num_available:
+        if not self.action_space.contains(action):
             raise ValueError(f"action must be 0..{self.num_available - 1}, got {action}")
         # The user clicks with the taste that the agent has seen; v changes only afterwards.
-        # appendix: a product cannot be recommended twice, as the user drifts; published code: no
+        # appendix: repeats are unlikely to be clicked, as the user drifts; published code: no
         # rule against it; we add none. The drift is slow: repeating the product that was best at
         # first scores as well as the oracle, within 0.01.
         product = int(self.available[action])
@@ -292,7 +292,8 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 # ---- floors and ceilings: what could be reached ----
 
 # Each scores the products on offer, (K,), from taste c.v (K,) and popularity mu (K,); the best is
-# recommended. The oracle knows all. c-only is the ceiling for unseen products when mu is hidden.
+# recommended. The oracle knows all, but not what comes after. c-only is the ceiling for unseen
+# products when mu is hidden and clicks are not remembered.
 # CTR with 500 of the test products on offer: 0.158, 0.302, 0.633, 0.658 (standard errors 0.002).
 POLICIES = {
     "random": lambda taste, mu, rng: rng.random(len(mu)),
@@ -431,7 +432,7 @@ class Args:
     policy: Literal["random", "c-only", "mu-only", "oracle"] = "c-only"  # who recommends
     pool: Literal["train", "valid", "test"] = "test"  # products to draw from
     num_available: int = NUM_AVAILABLE  # products on offer in the episode (Table 3)
-    seed: int = 5  # ours: 5 draws a typical user
+    seed: int = 5  # of user and products on offer; ours: 5 draws a typical user
     episodes: int = 200  # episodes per entry of the table of floors and ceilings
     out: Path = Path("runs/demo")  # folder for the pictures
 

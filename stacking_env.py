@@ -67,7 +67,7 @@ NUM_AVAILABLE = 20  # Table 3 "actions per episode"
 LAMBDA_TOP = LAMBDA_AVG = 0.5  # Eq. 4
 FRAMES = 4  # A.4 "stack past 4 frames"
 SIZE = 84  # A.4 "84x84 grayscale image"
-DROP_GAP = 0.02  # ours, m: A.4 "soft drop"; the shapes are .08 to 1.92 m wide
+DROP_GAP = 0.02  # ours, m: A.4 "soft drop"; the shapes are .16 to 1.92 m wide
 CYLINDERS = (798, 799, 800)  # published code: the start cylinders are two copies of one of these
 CENTRE, AXIS_GAP = (-0.2, 0.2), (1.0, 1.6)  # published code, m: "random locations on a line" (A.4)
 
@@ -104,7 +104,7 @@ LIGHT = (0.24, 0.52, 0.82)
 AMBIENT, DIFFUSE = 0.35, 0.65  # ours: a face turned away from the light keeps a third of its colour
 LUMINANCE = (0.299, 0.587, 0.114)  # published code: grey of red, green, blue
 TABLE = (4.0, 2.0, 0.1)  # half sizes, m: published code draws 8 x 4; the thickness is ours
-WOOD = (0.82, 0.66, 0.45)  # ours: the lit table top is 120 of 255 in the policy's grey picture
+WOOD = (0.82, 0.66, 0.45)  # ours: a lit table top of 120 of 255 in grey (2D Place: 167)
 
 
 # ---- A.4: the 810 shapes ----
@@ -539,6 +539,7 @@ class StackingEnv(gym.Env):
         self.action_space = spaces.Dict(parts)
         # The simulation is made in the first reset, so in the worker process of a vector env.
         self._bullet: Bullet | None = None
+        self._over = True  # nothing to step yet
         self._frames: list[np.ndarray] = []  # colour pictures of the last reset or step
 
     def __reduce__(self) -> None:
@@ -555,7 +556,7 @@ class StackingEnv(gym.Env):
         empty_world(self._bullet)
         self._bodies: list[int] = []  # Bullet's numbers
         self.shape_ids: list[int] = []  # ids of the shapes in the scene, the two cylinders first
-        self._steps, self._frames = 0, []
+        self._steps, self._frames, self._over = 0, [], False
         # appendix: "random heights"; published code: one of three, the same for both, as here
         cylinder = int(rng.choice(CYLINDERS))
         centre, gap = rng.uniform(*CENTRE), rng.uniform(*AXIS_GAP)
@@ -566,7 +567,9 @@ class StackingEnv(gym.Env):
         return self._observe(moved=True), {}
 
     def step(self, action: dict) -> tuple[dict, float, bool, bool, dict]:
-        """One action; see the class for what it must be."""
+        """One action; see the class for what it must be. After the end: ResetNeeded."""
+        if self._over:
+            raise ResetNeeded("the episode is over (or none began): call reset()")
         choice, stop = operator.index(action["choice"]), operator.index(action["stop"])
         place = np.asarray(action.get("position", ()), dtype=float)  # (d,)
         if not 0 <= choice < self.num_available or stop not in (0, 1):
@@ -586,12 +589,11 @@ class StackingEnv(gym.Env):
             self._add(shape_id, x, y, self.top(), COLOURS[shape_id])
             self._settle()
         terminated, truncated = bool(stop), not stop and self._steps >= MAX_STEPS
-        reward, info = 0.0, {}
-        if terminated or truncated:
+        reward, info, self._over = 0.0, {}, terminated or truncated
+        if self._over:
             heights = self.poses()[0][:, 2]
-            reward = eq4_reward(heights)
             # published code: the score uses shape origins; ours: centres of mass, as in the reward
-            info = {METRIC: float(heights.max())}
+            reward, info = eq4_reward(heights), {METRIC: float(heights.max())}
         return self._observe(moved=drop), reward, terminated, truncated, info
 
     def _add(self, shape_id: int, x: float, y: float, top: float, rgb: tuple) -> None:

@@ -92,8 +92,9 @@ def test_action_observations_depend_on_the_seed_and_the_action_alone(module):
         assert both.shape[:2] == (2, 4) and np.array_equal(both[1:], one)
         with pytest.raises(ValueError):
             module.action_observations([module.NUM_ACTIONS], 4, modality)
-    with pytest.raises(ValueError):
-        module.action_observations([3], 4, "smell")
+    for n, modality in ((4, "smell"), (0, (*module.MODALITIES, "")[0])):
+        with pytest.raises(ValueError):
+            module.action_observations([3], n, modality)
 
 
 def play(module, seed, steps, n=3):
@@ -171,6 +172,18 @@ def test_bad_pools_are_refused(module):
                     ([1.0, 2.0], 2), ([-1, 2], 2), ([], 1)):  # fmt: skip
         with pytest.raises(ValueError):
             create(np.array(pool), K)
+
+
+def test_a_step_before_the_reset_or_after_the_end_is_refused(module):
+    env = make(module).unwrapped
+    env.action_space.seed(0)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(env.action_space.sample())
+    env.reset(seed=0)
+    while not any(env.step(env.action_space.sample())[2:4]):
+        pass
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(env.action_space.sample())
 
 
 def test_pictures_come_after_a_reset_and_only_where_they_were_asked_for(module):
