@@ -331,7 +331,7 @@ LOCK = Lock()  # one at a time writes tables
 
 def run(job: Job, args: Args) -> bool:
     """Run a job unless it is finished, and write its scores; whether there are any."""
-    log = job.folder.with_suffix(".log")
+    log = Path(f"{job.folder}.log")
     if not score_rows(job):
         begun = job.kind == "train" and (job.folder / "args.json").exists()
         words = shlex.split(job.command)[1:] + ["--resume"] * begun
