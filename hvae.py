@@ -110,7 +110,7 @@ PAPER = dict(updates=0, batch_observations=1024, set_size=1024, relative=False, 
 # appendix: width 64, one column for CREATE; published code: this for pictures; we do as the code.
 PAPER_VISUAL = dict(batch_size=32, epochs=5_000, hidden=128)
 
-# How the short recipes leave the paper. (Three constants do so further down: search for "paper".)
+# How the short recipes leave the paper. (Four lines do so further down: search for "paper".)
 LAPTOP = dict(
     # Raw cells run to 78: the networks would first have to learn to subtract the start to a tenth
     # of a cell before any skill shows. Differences show it from the first update.
@@ -501,7 +501,7 @@ class VAE(ObservationModel):
     """The non-hierarchical baseline (B): each observation for itself, averaged at the end."""
 
     # published code: a quarter of the HVAE's updates, another initialisation, and the mean of 62 or
-    # 128 observations; we give both models the same, so that only the hierarchy differs.
+    # 128 observations; we give both models the same, but for the linear path, which the VAE lacks.
     def __init__(self, args, shape):
         size, hidden = args.representation_size, args.hidden
         super().__init__(args, shape, latents=(size,))

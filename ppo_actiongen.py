@@ -9,7 +9,7 @@ So new actions are simply another list of vectors. Three things help: a random s
 training actions in every episode, an entropy bonus, and selection on held-out *validation* actions.
 
     python ppo_actiongen.py gridworld --quick         # minutes; or: recsys, create, stacking
-    python ppo_actiongen.py gridworld --recipe paper  # Tables 3 and 4 to the letter
+    python ppo_actiongen.py gridworld --recipe paper  # the policy of Tables 3 and 4
     python ppo_actiongen.py gridworld --method nearest-neighbor | --ent-coef 0 | --no-subsample
     python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0     # C.2
     python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --num-available 20
@@ -70,7 +70,7 @@ class Args:
     modality: str | None = None  # what the action encoder sees (B)
     split: str = "default"  # of the actions (A.1 to A.4): default, full, ...
     split_seed: int = 0  # published: one split for all seeds
-    recipe: Literal["fast", "paper"] = "fast"  # ours, or Tables 3 and 4 to the letter
+    recipe: Literal["fast", "paper"] = "fast"  # ours, or the policy of Tables 3 and 4
     quick: bool = False  # the same protocol at a laptop's budget
     seed: int = 0  # one seed, one run, bit for bit (on a CPU)
     task: str | None = None  # CREATE: which of the 12 tasks (C.1)
@@ -214,7 +214,7 @@ def mlp(inputs: int, H: int) -> nn.Sequential:
 
 
 def cnn(frames: int, H: int, ink: bool) -> nn.Sequential:
-    """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU."""
+    """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU; ink: 3-layer."""
     # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side. Ink: 42 -> 21 -> 11 -> 6. From
     # 3 x 3 the code knows less well where the balls are: push, 4M steps, validation .64, not .75.
     channels, side = ([frames, 16, 32, 64], 6) if ink else ([frames, 16, 16, 32, 32, 32], 3)
@@ -628,22 +628,23 @@ def load_table(args: Args) -> np.ndarray:
 def check(args: Args) -> None:
     """Refuse, before anything is made, what cannot be trained or has no effect."""
     for name, value in vars(args).items():
-        if type(value) is int and value < (0 if "seed" in name else 1) or value != value:
+        least = int(type(value) is int and "seed" not in name)
+        if type(value) in (int, float) and not value >= least:
             raise ValueError(f"{name} cannot be {value}")
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
-        rule = f"minibatch_size x num_minibatches of num_envs, both of {WORLD_SIZE} processes"
-        raise ValueError(f"these have to be multiples: {rule}")
+        raise ValueError(f"{size} steps are no multiple of num_envs, or of {WORLD_SIZE} processes")
     if not 2 <= size <= args.total_timesteps:
         raise ValueError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
     env, nearest, is_ours = args.env, args.method == "nearest-neighbor", args.method == "utility"
     learned, default = args.representation in ENCODERS, default_args(env, args.recipe, args.quick)
     one_set = nearest or args.adapt or not args.subsample
     effects = {  # flags: whether they change anything; a run is named after them
-        "modality hvae_recipe": learned,
+        "modality": learned,
+        "hvae_recipe": learned and not args.finetune,
         "task subgoal_reward": env == "create",
         "placement": env == "stacking",
-        "fully_observable": env == "recsys" and not learned,
+        "fully_observable": env == "recsys" and args.representation == "engineered",
         "representation": env == "gridworld" or not args.representation.startswith("engineered-"),
         "ent_floor": args.ent_coef > 0,
         "num_available": not one_set or not (args.eval_available or args.adapt),
@@ -838,16 +839,15 @@ def published_scores(args: Args) -> dict[str, float]:
 
 def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
     """Claim the run's folder: it, the representations, the checkpoint to go on from."""
-    # Making the folder is the claim. If representations fail, it is given back. What is killed
-    # later goes on with --resume, from its checkpoint or the beginning.
+    # The new folder is the claim; without representations it is given back.
     folder = run_path(args)
     saved, path = folder / "args.json", folder / "checkpoint.pt"
     if is_new := not (args.resume and saved.exists()):
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            raise ValueError(f"{folder} exists; --resume goes on with a run") from None
-        saved.write_text(json.dumps(vars(args), indent=1))
+            raise ValueError(f"{folder} exists; --resume goes on with it") from None
+        hvae.write(saved, lambda file: file.write(json.dumps(vars(args), indent=1).encode()))
     for name, there in json.loads(saved.read_text()).items():
         if name not in FREE and there != (here := getattr(args, name, None)):
             raise ValueError(f"cannot resume {folder}: {name} is {there!r} there, {here!r} here")
@@ -869,10 +869,9 @@ def load(path: Path) -> dict:
         raise ValueError(f"{path} is no checkpoint: {type(e).__name__}") from None
 
 
-COLUMNS = (
-    "step seconds sps train_score valid_score episode_score episode_return episode_length "
-    "pg_loss v_loss entropy clip_fraction approx_kl learning_rate explained_variance"
-).split()
+COLUMNS = "step seconds sps train_score valid_score".split()
+COLUMNS += "episode_score episode_return episode_length pg_loss v_loss entropy".split()
+COLUMNS += "clip_fraction approx_kl learning_rate explained_variance".split()
 
 
 def record(row: dict, metrics, writer) -> None:
@@ -925,8 +924,7 @@ def plot_curve(folder: Path, results: dict) -> None:
     os.environ.pop("MPLBACKEND", None)  # a notebook's can end the import
     from matplotlib.figure import Figure  # not pyplot: that would look for a display
 
-    rows = csv.DictReader((folder / "metrics.csv").read_text().splitlines())
-    rows = [row for row in rows if row["train_score"]]
+    rows = [row for row in csv.DictReader((folder / "metrics.csv").open()) if row["train_score"]]
     axes = (figure := Figure(figsize=(6, 4), layout="tight")).subplots()
     for name in [n for n in ("train_score", "valid_score") if rows[0][n]]:
         points = [(int(row["step"]) / 1e6, float(row[name])) for row in rows]
@@ -976,8 +974,7 @@ def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
     if analyses != (None, None, None) and np.isin(pool, known).any():
         raise ValueError("the analyses choose among unseen actions; these were trained on")
     if gap is not None:
-        create_env = hvae.load_environment("create")  # no other actions have angles
-        pool = pool[create_env.angle_gaps(pool, known) >= gap]
+        pool = pool[hvae.load_environment("create").angle_gaps(pool, known) >= gap]
     if distance is not None:
         squared = torch.cdist(table[pool].double(), table[known].double()).amin(1).square().numpy()
         # published: absolute distances, which depend on the encoder
@@ -1000,6 +997,9 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     pool, K = phases["train" if args.adapt else options.actions]  # adapted: to the test actions
     if options.episodes < 1:
         raise ValueError(f"episodes cannot be {options.episodes}")
+    for flag, wrong in (("min_angle_gap", args.env != "create"), ("actions", args.adapt)):
+        if wrong and getattr(options, flag) not in (None, "test"):
+            raise ValueError(f"{flag} {getattr(options, flag)} has no effect or sense here")
     pool = restrict_pool(options, weights["table"], pool, phases["learn"][0])
     offer = pool, min(K, len(pool)) if options.num_available is None else options.num_available
     envs = make_envs(args, pool, 1, offer[1], *stream)

@@ -31,6 +31,7 @@ from paper import ROOT, TABLE, hvae, ppo_actiongen, read  # noqa: E402
 METHODS = {  # name -> label and colour, the same in every table and picture, in this order
     "ours": ("Ours", "#0b5394"),
     "ours_bilinear": ("Ours, bilinear", "#45a0d8"),
+    "ours_more_entropy": ("Ours, entropy 0.02", "#45a0d8"),
     "ours_alternate_modality": ("Ours, one-hot", "#7fb8e0"),
     "ours_video": ("Ours, video", "#7fb8e0"),
     "engineered": ("Engineered", "#2e8b6f"),
@@ -230,9 +231,7 @@ def draw_bars(path: Path, cells: Cells) -> None:
     save(figure, path, key)
 
 
-def draw_lines(
-    path: Path, panels: dict[str, list[tuple]], xlabel: str, columns=3, width=3.1
-) -> None:
+def draw_lines(path: Path, panels: dict, xlabel: str, columns=3, width=3.1) -> None:
     """Panels of (label, {phase or step: its seeds}, look): mean and standard deviation."""
     least = 6.5 / len(panels)  # room for the legend
     figure, axes = canvas(len(panels), columns, max(width, least), 0.3 + 0.7 * width)

@@ -433,6 +433,9 @@ def test_a_run_that_diverges_says_so(tmp_path):
 # ---- options ----
 REFUSED = """gridworld --num-available 0; num_available cannot be 0
 gridworld --gamma nan; gamma cannot be nan
+gridworld --learning-rate -1; learning_rate cannot be -1
+recsys --fully-observable --representation x.npz; fully_observable
+gridworld --finetune nowhere --hvae-recipe paper; hvae_recipe
 gridworld --num-available 600; 600 on offer out of 512
 gridworld --eval-available 300; 300 on offer out of 256
 gridworld --total-timesteps 10; one rollout takes 2048
@@ -564,7 +567,7 @@ def test_evaluate_writes_one_row_per_question_and_a_gif(finished, tmp_path):
     asked = [(r["num_available"], r["unseen_ratio"]) for r in rows if 0 <= float(r["score"]) <= 1]
     assert asked == [("10", ""), ("50", ""), ("50", "0.5")] and gif.read_bytes()[:3] == b"GIF"
     refused = dict(num_available=0), dict(num_available=300), dict(episodes=0)
-    for options in (*refused, dict(actions="train", unseen_ratio=0.5)):
+    for options in (*refused, dict(actions="train", unseen_ratio=0.5), dict(min_angle_gap=9.0)):
         with pytest.raises(ValueError):
             ppo.evaluate_run(ppo.EvaluateArgs(**(common | options)))
 
