@@ -43,7 +43,7 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 import torch.distributed as dist
-import torch.distributed.nn  # else Adam does, too late, and gloo's threads outlive the end
+import torch.distributed.nn  # else Adam does, too late: gloo's threads stay
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
@@ -73,7 +73,7 @@ class Args:
     recipe: Literal["fast", "paper"] = "fast"  # ours, or the policy of Tables 3 and 4
     quick: bool = False  # the same protocol at a laptop's budget
     seed: int = 0  # one seed, one run, bit for bit (on a CPU)
-    task: str | None = None  # CREATE: which of the 12 tasks (C.1)
+    task: str | None = None  # CREATE: one of 12 (C.1)
     subgoal_reward: bool = True  # CREATE: --no-subgoal-reward is C.3
     fully_observable: bool = False  # Recommender: c_i holds mu_i, too (C.5)
     placement: str | None = None  # Stacking: none, 1d, 2d (C.6)
@@ -103,13 +103,13 @@ class Args:
     small_gains: bool = True  # published code: f_nu starts with gains of 0.01
     ink: bool = False  # ours: small pictures, lines on nothing
     eval_every: int = 410_000  # steps between evaluations
-    valid_episodes: int = 640  # episodes of each of them
-    eval_episodes: int = 5000  # episodes of the test (published code)
+    valid_episodes: int = 640  # of each
+    eval_episodes: int = 5000  # of the test (published code)
     hvae_recipe: str = "laptop"  # of the encoder: laptop, quick, paper
-    runs_dir: str = "runs"  # runs and representations live here
+    runs_dir: str = "runs"  # of runs and representations
     run_name: str | None = None  # the run's folder (None: see run_path)
-    resume: bool = False  # go on from the checkpoint, bit for bit
-    device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
+    resume: bool = False  # go on, bit for bit
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if any
 
     def __post_init__(self):
         self.adapt = self.adapt or self.finetune is not None
@@ -141,13 +141,13 @@ FAST = {
         num_available=20,  # a smaller set has fewer favourites: more get practice
         eval_available=50,  # ... the tests stay Table 3's
         ent_floor=0.1,  # commit in the end: a stray skill ends in lava
-        hidden_size=128,  # many facts about skills and rivers
+        hidden_size=128,  # much to know about skills
         small_gains=False,  # 0.01 in all layers starves the gradient at first
         total_timesteps=10_000_000,
     ),
     "recsys": dict(
         bilinear=True,  # an MLP learns single products by heart
-        hidden_size=256,  # 64 miss more of the taste: validation .261, not .277
+        hidden_size=256,  # 64 miss more of the taste
         gamma=0.0,  # later clicks only drown the one that was earned
         minibatch_size=512,
         num_available=100,  # a fifth of the cost of a step
@@ -161,7 +161,7 @@ FAST = {
         hidden_size=256,  # which tool, and where: more to know
         minibatch_size=128,
         num_minibatches=16,
-        update_epochs=1,  # four move the policy too far: approx_kl .15, with one .02
+        update_epochs=1,  # four move the policy too far
         learning_rate=5e-4,
         clip_coef=0.2,  # goals are rare: let each one teach more
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions are the critic's
@@ -214,7 +214,7 @@ def mlp(inputs: int, H: int) -> nn.Sequential:
 
 
 def cnn(frames: int, H: int, ink: bool) -> nn.Sequential:
-    """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU; ink: 3-layer."""
+    """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU; ink: 3."""
     # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side. Ink: 42 -> 21 -> 11 -> 6. From
     # 3 x 3 the code knows less well where the balls are: push, 4M steps, validation .64, not .75.
     channels, side = ([frames, 16, 32, 64], 6) if ink else ([frames, 16, 16, 32, 32, 32], 3)
@@ -633,7 +633,7 @@ def check(args: Args) -> None:
             raise ValueError(f"{name} cannot be {value}")
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
-        raise ValueError(f"{size} steps are no multiple of num_envs, or of {WORLD_SIZE} processes")
+        raise ValueError(f"{size} steps: no multiple of num_envs, or of {WORLD_SIZE} processes")
     if not 2 <= size <= args.total_timesteps:
         raise ValueError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
     env, nearest, is_ours = args.env, args.method == "nearest-neighbor", args.method == "utility"
@@ -924,7 +924,7 @@ def plot_curve(folder: Path, results: dict) -> None:
     os.environ.pop("MPLBACKEND", None)  # a notebook's can end the import
     from matplotlib.figure import Figure  # not pyplot: that would look for a display
 
-    rows = [row for row in csv.DictReader((folder / "metrics.csv").open()) if row["train_score"]]
+    rows = [r for r in csv.DictReader((folder / "metrics.csv").open()) if r["train_score"]]
     axes = (figure := Figure(figsize=(6, 4), layout="tight")).subplots()
     for name in [n for n in ("train_score", "valid_score") if rows[0][n]]:
         points = [(int(row["step"]) / 1e6, float(row[name])) for row in rows]
@@ -972,7 +972,7 @@ def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
     analyses = options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio
     gap, distance, ratio = analyses
     if analyses != (None, None, None) and np.isin(pool, known).any():
-        raise ValueError("the analyses choose among unseen actions; these were trained on")
+        raise ValueError("the analyses choose among unseen actions")
     if gap is not None:
         pool = pool[hvae.load_environment("create").angle_gaps(pool, known) >= gap]
     if distance is not None:
@@ -997,9 +997,9 @@ def evaluate_run(options: EvaluateArgs) -> dict:
     pool, K = phases["train" if args.adapt else options.actions]  # adapted: to the test actions
     if options.episodes < 1:
         raise ValueError(f"episodes cannot be {options.episodes}")
-    for flag, wrong in (("min_angle_gap", args.env != "create"), ("actions", args.adapt)):
-        if wrong and getattr(options, flag) not in (None, "test"):
-            raise ValueError(f"{flag} {getattr(options, flag)} has no effect or sense here")
+    for flag in ["min_angle_gap"] * (args.env != "create") + ["actions"] * args.adapt:
+        if (value := getattr(options, flag)) not in (None, "test"):
+            raise ValueError(f"{flag} {value} has no effect or sense here")
     pool = restrict_pool(options, weights["table"], pool, phases["learn"][0])
     offer = pool, min(K, len(pool)) if options.num_available is None else options.num_available
     envs = make_envs(args, pool, 1, offer[1], *stream)
