@@ -168,5 +168,5 @@ def check_09():
 if __name__ == "__main__":
     if f"check_{sys.argv[-1]}" not in globals():
         sys.exit(__doc__)
-    globals()[f"check_{sys.argv[1]}"]()
-    print(f"exercise {sys.argv[1]}: ok")
+    globals()[f"check_{sys.argv[-1]}"]()
+    print(f"exercise {sys.argv[-1]}: ok")
