@@ -103,6 +103,7 @@ def group(rows: list[dict], phase="phase", column="score", every=False) -> Cells
     cells: Cells = defaultdict(lambda: defaultdict(list))
     for row in sorted(rows, key=lambda row: tested(row[phase])):
         place = row["env"], row["task"], int(row["steps"] or 0)
+        METHODS.setdefault(row["method"], (row["method"], "#888888"))  # a row of your own in TABLE
         if row[column] and (every or place[2] == usual[row["env"]][1]):
             cells[place, row["method"]][row[phase]].append(float(row[column]))
     tasks, methods = [*dict.fromkeys((row["env"], row["task"]) for row in rows)], [*METHODS]
@@ -233,9 +234,8 @@ def draw_bars(path: Path, cells: Cells) -> None:
 
 def draw_lines(path: Path, panels: dict, xlabel: str, columns=3, width=3.1) -> None:
     """Panels of (label, {phase or step: its seeds}, look): mean and standard deviation."""
-    least = 6.5 / len(panels)  # room for the legend
-    figure, axes = canvas(len(panels), columns, max(width, least), 0.3 + 0.7 * width)
-    key = {}
+    size = max(width, 6.5 / len(panels)), 0.3 + 0.7 * width  # at least: room for the legend
+    (figure, axes), key = canvas(len(panels), columns, *size), {}
     for axis, (name, some) in zip(axes, panels.items(), strict=True):
         for label, phases, look in some:
             x = [tested(phase) / (1e6 if xlabel == "million steps" else 1) for phase in phases]

@@ -97,7 +97,7 @@ def test_a_table_shows_every_budget_and_one_line_on_what_is_not_learned(tmp_path
     monkeypatch.setattr(report, "RESULTS", tmp_path)
     assert {report.section(name, True) for name in [*paper.TABLE, "main", "fig14"]} == {""}
     rows = [("ours", 0.7, 10**7), ("ours", 0.9, 10**7), ("engineered", 0.5, 10**7)]
-    rows += [("ours", 0.2, 10**6), ("continuous_output", 0.004, 10**7)]
+    rows += [("ours", 0.2, 10**6), ("continuous_output", 0.004, 10**7), ("mine", 0.3, 10**6)]
     rows = [dict(method=m, score=s, steps=n, seed=i) for i, (m, s, n) in enumerate(rows)]
     write(tmp_path / "gridworld.csv", [r | {"phase": p} for r in rows for p in ("train", "test")])
     page = tmp_path / "README.md"
@@ -108,7 +108,8 @@ def test_a_table_shows_every_budget_and_one_line_on_what_is_not_learned(tmp_path
     report.main(check=True)
     text = page.read_text()
     assert "|Ours|10M|2|0.800±0.100 (0.904)|0.800±0.100 (0.703)|1.000|\n" in text
-    assert "(random play: 0.003): Continuous output.\n" in text and "|Ours|1M|1|0.200" in text
+    assert "(random play: 0.003): Continuous output.\n" in text
+    assert "|Ours|1M|1|0.200" in text and "|mine|1M|1|0.300" in text
     assert text.endswith("![gridworld](gridworld.png)\n<!-- end:gridworld -->\nb\n")
     assert {p[2] for p, _ in report.group(paper.read(tmp_path / "gridworld.csv"))} == {10**7}
 
