@@ -100,7 +100,7 @@ TABLE = {
     },
     "gridworld": rows("gridworld", METHODS | ENGINEERED | ONE_HOT),
     "recsys": rows("recsys", RECSYS),
-    "create-push": rows("create --task push", METHODS | VIDEO),
+    "create-push": rows("create --task push", METHODS | VIDEO | MORE_ENTROPY),
     "create-seesaw": rows("create --task seesaw", METHODS | VIDEO | ENGINEERED | MORE_ENTROPY),
     "create-obstacle": rows("create --task obstacle", METHODS | VIDEO | MORE_ENTROPY),
     "stacking": rows("stacking", METHODS | ENGINEERED),
