@@ -103,7 +103,6 @@ def group(rows: list[dict], phase="phase", column="score", every=False) -> Cells
     cells: Cells = defaultdict(lambda: defaultdict(list))
     for row in sorted(rows, key=lambda row: tested(row[phase])):
         place = row["env"], row["task"], int(row["steps"] or 0)
-        METHODS.setdefault(row["method"], (row["method"], "#888888"))  # a row of your own in TABLE
         if row[column] and (every or place[2] == usual[row["env"]][1]):
             cells[place, row["method"]][row[phase]].append(float(row[column]))
     tasks, methods = [*dict.fromkeys((row["env"], row["task"]) for row in rows)], [*METHODS]
@@ -272,6 +271,7 @@ def section(name: str, draw: bool) -> str:
     rows = [row for file in files for row in read(RESULTS / f"{file}.csv")]
     if not rows:
         return ""
+    METHODS.update({m: (m, "grey") for r in rows if (m := r["method"]) not in METHODS})  # your own
     if name == "fig14":
         seen, valid = (group(rows, "step", f"{phase}_score", True) for phase in ("train", "valid"))
         panels, grey = {}, dict(color="0.5", ls="--")  # a method's longest runs come last, and stay
