@@ -749,8 +749,7 @@ def probe(mean, train_ids, held_out_ids, env="gridworld", halves=None) -> dict[s
     if env == "gridworld":
         moves = np.arange(len(mean)) // 4 ** np.arange(5)[:, None] % 4  # A.1: (5, 1024) move ids
         net = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])[moves].sum(0)  # (1024, 2)
-        # Linear read-out of the net displacement.
-        scores["net_r2"] = linear(net)
+        scores["net_r2"] = linear(net)  # read-out of the net displacement
         # Logistic read-outs of the five moves, mean; by chance 0.25.
         hits = []
         for move in moves:
@@ -798,6 +797,7 @@ def report(path: Path, tables: np.ndarray, args: Args) -> None:
 
 def plot_tsne(mean: np.ndarray, labels: np.ndarray, path: Path, title: str) -> None:
     """Figures 4-6: representations (count, D) by t-SNE, one hue and mark per label."""
+    os.environ.pop("MPLBACKEND", None)  # a notebook's, inherited, can end the import
     from matplotlib.figure import Figure
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits  # comes with scikit-learn

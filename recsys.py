@@ -346,6 +346,8 @@ def episode_text(env: RecSysEnv) -> str:
 
 def draw_timeline(available: np.ndarray, timeline: list, ending: str = "") -> np.ndarray:
     """An episode from left to right (`RecSysEnv.timeline`): uint8 (480, 900, 3)."""
+    # A notebook's choice, inherited, can end the import of matplotlib.
+    os.environ.pop("MPLBACKEND", None)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -441,8 +443,6 @@ def main(args: Args) -> None:
     """What `python recsys.py` does."""
     if args.episodes < 1:
         raise ValueError(f"episodes is {args.episodes}, at least 1")
-    # A notebook's choice, inherited, can end the import of matplotlib.
-    os.environ.pop("MPLBACKEND", None)
     pool = split_actions()[args.pool]
     env = RecSysEnv(pool, args.num_available, "rgb_array")
     play(env, args.policy, np.random.default_rng([args.seed, 1]), seed=args.seed)
