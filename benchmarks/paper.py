@@ -153,7 +153,7 @@ class Args:
     seeds: tuple[int, ...] = (0, 1, 2)  # published: 5 seeds, 8 in Grid World
     recipe: Literal["fast", "paper"] = "fast"  # of policies; paper: of Figures 4-6's encoders, too
     budget: float = 1.0  # factor on the recipe's number of environment steps
-    extra: str = ""  # more flags for every training, as in --extra="--eval-episodes 1000"
+    extra: str = ""  # flags for each training, as --extra="--ent-coef 0.02"; rows keep their names
     jobs: int = 1  # commands at a time
     dry_run: bool = False  # only print the commands
     runs_dir: str = "runs"  # where the runs live, from the repository's root
