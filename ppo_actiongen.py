@@ -72,7 +72,7 @@ class Args:
     split_seed: int = 0  # published: one split for all seeds
     recipe: Literal["fast", "paper"] = "fast"  # ours, or the policy of Tables 3 and 4
     quick: bool = False  # the same protocol at a laptop's budget
-    seed: int = 0  # one seed, one run, bit for bit (on one kind of CPU)
+    seed: int = 0  # one run, bit for bit, on one kind of CPU
     task: str | None = None  # CREATE: one of 12 (C.1)
     subgoal_reward: bool = True  # CREATE: --no-subgoal-reward is C.3
     fully_observable: bool = False  # Recommender: c_i holds mu_i, too (C.5)
