@@ -1,11 +1,11 @@
 """Grid World with 1,024 five-move skills (appendix A.1).
 
-An agent on a 9x9 grid crosses a river of lava through its one opening and walks to the goal. An
-action is a whole *skill*: five moves up, down, left or right. In every episode 50 skills are on
-offer. At test time they are skills never used in training: the agent has to understand a skill
-from recordings of it in another, larger and empty grid.
+An agent on a 9x9 grid crosses a river of lava (A.1: "lava wall") through its one opening and walks
+to the goal. An action is a whole *skill*: five moves, each up, down, left or right. In every
+episode 50 skills are available. At test time none of them was used in training: the agent has to
+understand a skill from recordings of it in another, larger and empty grid.
 
-    #########     #  wall
+    #########     #  wall: here always the outer ring, which only stops the agent
     #A..~...#     A  agent, always starts at (1, 1)
     #...~...#     ~  lava: a whole row or column, here the column x = 4
     #...o...#     o  the opening (the subgoal), here at y = 3
@@ -15,27 +15,15 @@ from recordings of it in another, larger and empty grid.
     #...~..G#     e.g. skill DDRRR, then RRRDD, then DDDDD: subgoal at move 5, goal at move 12
     #########
 
-Commands:
+    python gridworld.py       # two episodes, layouts, skills: text, and pictures in runs/demo (5 s)
+    python gridworld.py --part train --num-available 10 --seed 3
 
-    python gridworld.py       # a planned and a random episode as text and GIF, and one picture of
-                              # layouts, skills and recordings, in runs/demo (5 seconds)
-    python gridworld.py --pool train --num-available 10 --seed 3
-
-Paper map (appendix -> here):
-
-    A.1 Actions                SKILL_MOVES, walk
-    A.1 Action set split       split_actions
-    B   engineered             engineered_representations
-    B   Fig. 4 (quadrants)     action_labels
-    A.1 State                  LAYOUTS, GridWorldEnv._observe
-    A.1 Reward, Eq. 1          GridWorldEnv.step
-    A.1 Action observations    action_observations
-    Table 3 (50 actions, 10)   NUM_AVAILABLE, MAX_SKILLS
+The sections bear A.1's names, in another order. Two marks: [code] is the authors' released
+implementation, used where the appendix is silent; [here] is this repository's choice, with reason.
 """
 
-import functools
 import heapq
-import operator
+import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,145 +33,149 @@ from typing import Literal
 import gymnasium as gym
 import numpy as np
 import tyro
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from PIL import Image, ImageDraw, ImageFont
 
 # ---- constants (each with its source) ----
 NUM_ACTIONS = 1024  # A.1: 4^5 sequences of 5 moves in 4 directions
 SKILL_LENGTH = 5  # A.1
-METRIC = "success"  # 1.0 when the episode ended on the goal, else 0.0
-MODALITIES = ("xy", "onehot")  # B: state trajectories (the default), one-hot states
 NUM_AVAILABLE = 50  # Table 3 "actions per episode"
 MAX_SKILLS = 10  # A.1, Table 3 "max. episode length"
-MAX_MOVES = MAX_SKILLS * SKILL_LENGTH  # A.1: 50, N_max of Eq. 1
+MAX_MOVES = 50  # A.1: 10 skills of 5 moves; N_max of Eq. 1
 LAMBDA_SUBGOAL = 0.1  # Eq. 1
 LAMBDA_GOAL = 0.9  # Eq. 1
-SIZE = 9  # A.1; the outer ring is wall, so the agent walks on 7x7 cells
-EMPTY, WALL, GOAL, LAVA, AGENT, SUBGOAL = 1, 2, 8, 9, 10, 11  # published code (A.1: "integer ID")
-START = 1 * SIZE + 1  # A.1: top left. A cell (x, y) is the number x * 9 + y (published code)
-RIVERS = (3, 4, 5)  # published code: rows or columns of the lava (A.1: "randomly placed")
-OPENINGS = (1, 2, 3, 4, 5, 6, 7)  # published code: any cell of the river may be the opening
-PLAY_LOW, PLAY_HIGH = 1, 78  # A.1: 80x80 grid; published code: its ring is wall
 
-# ---- A.1 Actions, action set split; B: what is known about them ----
-MOVE_NAMES = "RDLU"  # published code: right, down, left, up are the moves 0..3
+# Read by the other files. In each tuple the first entry is the default.
+METRIC = "success"  # 1.0 when the episode ended on the goal, else 0.0
+SPLITS = ("default",)  # A.1
+MODALITIES = ("xy", "onehot")  # B: forms of a recording, cells (x, y) or one-hot vectors
+VARIANTS = ("12d", "5d")  # of the engineered representations
+
+SIZE = 9  # A.1; the outer ring is wall [code], so the agent walks on 7x7 cells
+EMPTY, WALL, GOAL, LAVA, AGENT, SUBGOAL = 1, 2, 8, 9, 10, 11  # [code] (A.1: "integer ID")
+RIVERS = (3, 4, 5)  # [code]: rows or columns of the lava (A.1: "randomly placed")
+OPENINGS = (1, 2, 3, 4, 5, 6, 7)  # [code]: any cell of the river may be the opening
+# The 80x80 play grid has a ring of wall, too [code], so the agent stands on 1..78 both ways.
+PLAY_LOW = 1
+PLAY_HIGH = 78
+
+# ---- A.1 Actions and action set split, B: what is known about the skills ----
+MOVE_NAMES = "RDLU"  # [code]: right, down, left, up are the moves 0..3
 MOVE_DELTAS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  # (4, 2): (dx, dy)
-# published code: ids in base 4, the first move is the lowest digit: 0 = RRRRR, 1 = DRRRR.
-SKILL_MOVES = np.arange(NUM_ACTIONS)[:, None] // 4 ** np.arange(SKILL_LENGTH) % 4  # (1024, 5)
+
+# A skill's id written in base 4 is its moves, the first move being the lowest digit [code]:
+# 0 = RRRRR, 1 = DRRRR, 340 = RDDDD, 1023 = UUUUU.
+SKILL_MOVES = (np.arange(NUM_ACTIONS)[:, None] // (4 ** np.arange(SKILL_LENGTH))) % 4  # (1024, 5)
 SKILL_NAMES = ["".join(MOVE_NAMES[move] for move in moves) for moves in SKILL_MOVES]
-# The same moves as steps from one cell number to the next, as plain integers (fast to go through).
-SKILL_STEPS = (MOVE_DELTAS @ (SIZE, 1))[SKILL_MOVES].tolist()  # (1024, 5)
-# B, Figure 4: upper right is red. In the order of the quarter turns from due east to due south.
-QUADRANTS = {"upper right": "tab:red", "upper left": "tab:green",
-             "lower left": "tab:blue", "lower right": "tab:orange"}  # fmt: skip
 
 
 def action_labels() -> np.ndarray:
-    """The quadrant each skill leads to (colours of Fig. 4), str (1024,): 256 skills of each."""
-    east, south = MOVE_DELTAS[SKILL_MOVES].sum(1).T  # (1024,) each
-    # Five is odd, so no skill ends where it began. A half axis belongs to the quadrant that follows
-    # it against the clock (published code): due east is upper right, due north is upper left.
-    turns = np.arctan2(-south, east) // (np.pi / 2)  # -2..2 quarter turns, 2 is -2
-    return np.array(list(QUADRANTS))[turns.astype(int)]
+    """The quadrant each skill leads to (the colours of Fig. 4): str (1024,), 256 of each."""
+    # With five moves, no skill ends where it began. Ties [code]: straight up counts as upper left,
+    # straight left as lower left, straight down as lower right, straight right as upper right.
+    east, south = MOVE_DELTAS[SKILL_MOVES].sum(1).T  # (1024,) each: net displacement
+    labels = np.full(NUM_ACTIONS, "upper right")
+    labels[(south < 0) & (east <= 0)] = "upper left"
+    labels[(south >= 0) & (east < 0)] = "lower left"
+    labels[(south > 0) & (east >= 0)] = "lower right"
+    return labels
 
 
 def engineered_representations(variant: str = "12d") -> np.ndarray:
-    """Ground-truth features of all skills, float32 (1024, d), in cells; y grows downwards.
+    """Ground-truth features of all skills (B), float32 (1024, d), in cells; y grows downwards.
 
     "12d": net (dx, dy) of the skill, then (dx, dy) of each of its five moves.
-    "5d": the five moves (B), right, down, left, up as -1, -1/3, 1/3, 1.
-    "path": (x, y) from the start after each of the five moves, d = 10.
+    "5d": the five moves; right, down, left, up as -1, -1/3, 1/3, 1. ValueError for others.
     """
-    # appendix: 5-d; published code: 12-d, signs flipped; we default to 12-d, because the published
-    # score was reached with it and move ids have no order. To a network our signs are the same.
+    # appendix: 5-d; [code] 12-d with all signs flipped, which is the same to a learner; [here] 12-d
+    # by default, not flipped: the paper's result was reached with it, and the numbers of 5-d
+    # suggest an order of the moves that does not exist.
+    if variant not in VARIANTS:
+        raise ValueError(f"variant {variant!r} is unknown; there are {VARIANTS}")
+    if variant == "5d":
+        return (SKILL_MOVES * 2 / 3 - 1).astype(np.float32)
     deltas = MOVE_DELTAS[SKILL_MOVES]  # (1024, 5, 2)
-    tables = {
-        "12d": np.column_stack([deltas.sum(1), deltas.reshape(-1, 10)]),
-        "5d": SKILL_MOVES * 2 / 3 - 1,
-        # ours: skills are alike if they pass the same cells
-        "path": deltas.cumsum(1).reshape(-1, 10),
-    }
-    if variant not in tables:
-        raise ValueError(f"variant {variant!r} is unknown; there are {', '.join(tables)}")
-    return tables[variant].astype(np.float32)
+    table = np.column_stack([deltas.sum(1), deltas.reshape(-1, 10)])  # (1024, 2 + 10)
+    return table.astype(np.float32)
 
 
 def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray]:
-    """Cut the skills at random 2:1:1 (A.1) into sorted ids "train", "valid", "test".
-
-    512 / 256 / 256 ids, disjoint. ValueError for any split but "default".
-    """
-    if split != "default":
+    """512 "train", 256 "valid", 256 "test" ids, random (A.1), sorted; ValueError if unknown."""
+    if split not in SPLITS:
         raise ValueError(f"split {split!r} is unknown; Grid World has only 'default'")
     order = np.random.default_rng(seed).permutation(NUM_ACTIONS)
-    parts = np.split(order, [NUM_ACTIONS // 2, NUM_ACTIONS * 3 // 4])
-    return dict(zip(("train", "valid", "test"), map(np.sort, parts), strict=True))
+    train, valid, test = np.split(order, [512, 768])
+    return dict(train=np.sort(train), valid=np.sort(valid), test=np.sort(test))
 
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
-    """`ids` (n,) as integers; ValueError unless distinct, known, and enough to offer so many."""
-    ids = np.asarray(ids)
+    """`ids` as a sorted int64 array (m,).
+
+    ValueError unless they are distinct, known, and m >= num_available >= 1.
+    """
+    ids = np.sort(np.asarray(ids))
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
+    if len(ids) == 0 or ids[0] < 0 or ids[-1] >= NUM_ACTIONS:
+        raise ValueError(f"action ids must lie in 0..{NUM_ACTIONS - 1}")
     if not 1 <= num_available <= len(ids):
-        raise ValueError(
-            f"{num_available} actions on offer out of {len(ids)}: from 1 to {len(ids)}"
-        )
-    if not 0 <= ids.min() <= ids.max() < NUM_ACTIONS:
-        raise ValueError(f"action ids lie in 0..{NUM_ACTIONS - 1}, got {ids.min()}..{ids.max()}")
+        raise ValueError(f"{num_available} available actions out of a pool of {len(ids)}")
     return ids.astype(np.int64)
 
 
 # ---- A.1 State: the grids; what a skill does in them ----
+# One grid for each river that is a column and each opening in it, indexed [x, y], without agent.
+# Start and goal lie outside of every river, so that each layout can be solved.
+columns = []
+for river in RIVERS:
+    for opening in OPENINGS:
+        grid = np.full((SIZE, SIZE), WALL, np.uint8)
+        grid[1:-1, 1:-1] = EMPTY
+        grid[7, 7] = GOAL  # A.1: bottom right corner
+        grid[river, 1:-1] = LAVA
+        grid[river, opening] = SUBGOAL
+        columns.append(grid)
+rows = [grid.T for grid in columns]  # the same with x and y exchanged
+LAYOUTS = np.array(columns + rows).reshape(42, SIZE * SIZE)  # (42, 9, 9) -> (42, 81)
 
-# The 2 x 3 x 7 = 42 layouts without the agent. Start and goal lie outside of every river, so each
-# can be solved. Number: 7 * (river - 3) + opening - 1, and 21 more when the river is a row.
-LAYOUTS = np.full((2, len(RIVERS), len(OPENINGS), SIZE, SIZE), EMPTY, np.uint8)  # [..., x, y]
-LAYOUTS[..., [0, -1], :] = LAYOUTS[..., [0, -1]] = WALL
-LAYOUTS[..., 7, 7] = GOAL  # A.1: bottom right corner
-for i, j in np.ndindex(len(RIVERS), len(OPENINGS)):
-    LAYOUTS[0, i, j, RIVERS[i], 1:-1] = LAVA  # a column: one x, all y
-    LAYOUTS[0, i, j, RIVERS[i], OPENINGS[j]] = SUBGOAL
-LAYOUTS[1] = LAYOUTS[0].swapaxes(2, 3)  # the same as rows
-LAYOUTS = LAYOUTS.reshape(-1, SIZE * SIZE)  # (42, 81): cell (x, y) at index x * 9 + y
+# A cell (x, y) is one number, x * 9 + y [code]: R, D, L, U add +9, +1, -9, -1 to it.
+START = 1 * SIZE + 1  # A.1: top left, the cell (1, 1)
+SKILL_OFFSETS = (MOVE_DELTAS @ (SIZE, 1))[SKILL_MOVES].tolist()  # 1024 lists of 5 such numbers
 
 
 def walk(grid: list[int], cell: int, skill: int) -> list[int]:
-    """The cells after each move of `skill`; fewer than five if the episode ends.
-
-    Moves are absolute. E.g. UUURD from (3, 2), cell 29: 28, 28, 28, 37, 38 (two bumps).
-    """
+    """The cells after each move of `skill` from `cell`; fewer than five if the episode ends."""
+    # E.g. UUURD from (3, 2), cell 29: 28, 28, 28, 37, 38. Its second and third up meet the wall.
     cells = []
-    for step in SKILL_STEPS[skill]:
-        if grid[cell + step] != WALL:  # A.1: a null move, it counts as one
-            cell += step
+    for offset in SKILL_OFFSETS[skill]:
+        # A.1: at the wall the agent stays where it is. This "null interaction" counts as a move.
+        if grid[cell + offset] != WALL:
+            cell += offset
         cells.append(cell)
-        if grid[cell] in (GOAL, LAVA):  # A.1: lava; published code: also the goal
+        # Lava ends the game in the middle of a skill (A.1), and so does the goal [code].
+        if grid[cell] in (GOAL, LAVA):
             break
     return cells
 
 
 # ---- A.1 the environment ----
-
-
 class GridWorldEnv(gym.Env):
     """Lava crossing with five-move skills (appendix A.1).
 
-    ## Description
-    A 9x9 grid with a ring of wall. One row or column (3, 4 or 5) is lava with a single opening, the
-    subgoal. Moves are absolute and deterministic. A move into a wall does nothing, but counts.
+    One row or column (3, 4 or 5) is lava with one opening, the subgoal. A move into a wall does
+    nothing, but counts. The best return (below) is undiscounted, and needs suitable skills.
 
     ## Action Space
-    `Discrete(K)`: a position in `available`. The skill's five moves are cut short by goal or lava.
+    `Discrete(K)`: a position in `available`.
 
     ## Observation Space
     `Dict(state=Box(0, 11, (81,), uint8), available=Box(0, 1023, (K,), int64))`. `state[x * 9 + y]`
     is the id of the cell (x, y): 1 empty, 2 wall, 8 goal, 9 lava, 10 agent (hides what it stands
-    on), 11 subgoal. `available` are the ids of the K skills on offer in this episode.
+    on), 11 subgoal. `available` are the ids of the K skills of this episode.
 
     ## Rewards
     0.1 for entering the subgoal the first time, 1 - 0.9 N / 50 for entering the goal with move N
-    (Eq. 1), else 0. The best return is 0.1 + 1 - 0.9 * 12 / 50 = 0.884 in every layout.
+    (Eq. 1, see `step`), else 0. The best return is 0.1 + 1 - 0.9 * 12 / 50 = 0.884 in every layout.
 
     ## Starting State
     Agent at (1, 1), goal at (7, 7), one of 42 layouts, K skills drawn from `action_pool` without
@@ -193,40 +185,54 @@ class GridWorldEnv(gym.Env):
     `terminated` on goal or lava, `truncated` after 10 skills. The last info: `success`, 0.0 or 1.0.
 
     ## Arguments
-    `action_pool`: distinct ids (default: the training skills). `num_available`: K (Table 3: 50).
-    `render_mode`: None or "rgb_array". `reset(options={"layout": 7})` chooses one of 0..41.
-    ValueError for a pool, K, action, layout or render_mode that does not exist.
+    `action_pool`: ids that `available` is drawn from (default: training skills of split seed 0).
+    `num_available`: K (Table 3: 50). `render_mode`: None or "rgb_array".
+    `reset(options={"layout": n})` chooses the layout: n = 7 * (river - 3) +
+    opening - 1, and 21 more when the river is a row. ValueError for whatever does not exist.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
 
     def __init__(self, action_pool=None, num_available=NUM_AVAILABLE, render_mode=None):
-        pool = split_actions()["train"] if action_pool is None else action_pool
-        self.action_pool = np.sort(check_ids(pool, num_available))
+        if action_pool is None:
+            action_pool = split_actions()["train"]
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode {render_mode!r} is unknown; there is 'rgb_array'")
-        self.num_available, self.render_mode = num_available, render_mode
+        self.action_pool = check_ids(action_pool, num_available)
+        self.num_available = num_available
+        self.render_mode = render_mode
         self.observation_space = gym.spaces.Dict(
             state=gym.spaces.Box(0, SUBGOAL, (SIZE * SIZE,), np.uint8),
             available=gym.spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
         )
         self.action_space = gym.spaces.Discrete(num_available)
-        self.trace, self.over = [], True  # cells of the last skill; nothing to step yet
+        self.over = True  # there is no episode to step in before the first reset
 
     def reset(self, *, seed=None, options=None):
-        """Draw a layout and the skills on offer; returns (observation, {})."""
-        super().reset(seed=None if seed is None else operator.index(seed))  # numpy integers, too
+        """Draw a layout and the available skills; returns (observation, {})."""
+        super().reset(seed=seed)
+        # A.1: "a randomly placed lava wall". It is drawn even when `options` name a layout, so that
+        # the skills drawn next are the same in every layout.
         drawn = self.np_random.integers(len(LAYOUTS))
-        layout = operator.index((options or {}).get("layout", drawn))
+        layout = (options or {}).get("layout", drawn)
         if layout not in range(len(LAYOUTS)):
             raise ValueError(f"layout is {layout}; there are 0..{len(LAYOUTS) - 1}")
-        # published code: draws sets from the system's entropy; ours: from the seeded generator.
-        self.available = pool = self.action_pool  # all of them: a position keeps its meaning
+        self.layout = int(layout)
+        self.grid = LAYOUTS[self.layout].tolist()  # plain integers, without the agent
+
+        # Every episode has its own random subset of the pool: the paper's *subsampling*. [code]
+        # draws it from the system's entropy; [here] the seeded generator, so a run can be repeated.
+        # The order is random, too: the policy scores each skill by itself. A whole pool is sorted.
+        pool = self.action_pool
+        self.available = pool
         if self.num_available < len(pool):
             self.available = self.np_random.choice(pool, self.num_available, replace=False)
-        self.layout, self.grid = layout, LAYOUTS[layout].tolist()  # integers, without the agent
-        self.trace, self.skill, self.moves = [START], None, 0
-        self.subgoal_taken = self.over = False
+
+        self.trace = [START]  # the cells of this episode: its start, and one after every move
+        self.skill = None  # id of the last skill
+        self.skill_start = 0  # index in `trace` of the cell where the last skill began
+        self.subgoal_taken = False
+        self.over = False
         return self._observe(), {}
 
     def step(self, action):
@@ -235,63 +241,80 @@ class GridWorldEnv(gym.Env):
             raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
         if not self.action_space.contains(action):
             raise ValueError(f"action is {action!r}; there are 0..{self.num_available - 1}")
+
+        # Walk. A move into a wall counts. Moves that were to follow after goal or lava do not.
         self.skill = int(self.available[action])
+        self.skill_start = len(self.trace) - 1
         cells = walk(self.grid, self.trace[-1], self.skill)
-        self.trace = [self.trace[-1], *cells]
-        self.moves += len(cells)
-        kinds = [self.grid[cell] for cell in cells]
+        self.trace += cells
+        moves = len(self.trace) - 1  # N_total of Eq. 1
+
+        # Reward (A.1, Eq. 1): the subgoal "for the first time" only, and the goal.
+        entered = [self.grid[cell] for cell in cells]
         reward = 0.0
-        if SUBGOAL in kinds and not self.subgoal_taken:  # Eq. 1: "for the first time"
+        if SUBGOAL in entered and not self.subgoal_taken:
             self.subgoal_taken = True
             reward += LAMBDA_SUBGOAL
-        if success := kinds[-1] == GOAL:
-            # appendix: (1 - 0.9) * N/50; published code: 1 - 0.9 * N/50; we do the latter, because
-            # the printed form pays more for a longer path, against its text ("a shorter path").
-            reward += 1 - LAMBDA_GOAL * self.moves / MAX_MOVES
-        terminated = success or kinds[-1] == LAVA
-        # published code: the limit is a true end. We report `truncated`; the learner may treat
-        # both alike. It falls on the last move of a skill: 10 skills of 5 moves are 50 moves.
-        truncated = not terminated and self.moves >= MAX_MOVES
+        success = entered[-1] == GOAL
+        if success:
+            # appendix: (1 - 0.9) * N/50; [code] 1 - 0.9 * N/50; [here] the latter, because the
+            # printed form pays more for a longer path, against its text ("a shorter path").
+            reward += 1 - LAMBDA_GOAL * moves / MAX_MOVES
+
+        # End (A.1): goal, lava, or the limit. [here] the limit is `truncated`, gymnasium's word for
+        # an end that only a clock makes; [code] makes no difference, and a learner may ignore it. A
+        # skill that nothing cuts has five moves, so the limit is met exactly.
+        terminated = success or entered[-1] == LAVA
+        truncated = not terminated and moves >= MAX_MOVES
         self.over = terminated or truncated
         info = {METRIC: float(success)} if self.over else {}
         return self._observe(), reward, terminated, truncated, info
 
     def _observe(self):
-        # A.1: raw ids; the published learner normalises them, not the environment. Neither the
-        # moves that are left nor whether the subgoal has been paid is part of the state.
-        state = LAYOUTS[self.layout].copy()  # fresh arrays: a learner may keep them
+        # State (A.1): the ids as they are; the learner scales them. Neither the moves that are left
+        # nor whether the subgoal has been paid can be seen in it. Both arrays are copies.
+        state = LAYOUTS[self.layout].copy()
         state[self.trace[-1]] = AGENT
         return {"state": state, "available": self.available.copy()}
 
     def render(self):
-        """The last of `render_frames`."""
-        return self.render_frames()[-1] if self.render_mode else None
+        """A picture of the episode after its last move, or None without a render_mode."""
+        return draw_frame(self, len(self.trace) - 1) if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last skill, one per move (after a reset: one); [] without render_mode."""
+        """Pictures of the last skill: its start, then one per move; [] without a render_mode."""
         if self.render_mode is None:
             return []
-        if not self.trace:
-            raise gym.error.ResetNeeded("call reset() before the first picture")
-        return [draw_frame(self, done) for done in range(1, len(self.trace)) or [0]]
+        return [draw_frame(self, moves) for moves in range(self.skill_start, len(self.trace))]
 
 
 gym.register("ActionGen/GridWorld-v0", entry_point="gridworld:GridWorldEnv")
 
 
-def make_vec(num_envs, action_pool, num_available=NUM_AVAILABLE, seed=0, **options) -> VectorEnv:
-    """`num_envs` environments with independent streams, restarted within the step that ends one.
+def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **options):
+    """A SyncVectorEnv of GridWorldEnv(action_pool, num_available, **options), which are seeded.
 
-    `envs.reset()` without a seed goes on with these streams. ValueError: see `GridWorldEnv`.
+    SAME_STEP: the step that ends an episode returns the first observation of the next one, and
+    infos["final_info"] holds `success`. Call `envs.reset()` without a seed, which would replace
+    `seed`. ValueError as in GridWorldEnv.
     """
-    one = functools.partial(GridWorldEnv, action_pool, num_available, **options)
-    envs = SyncVectorEnv([one] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-    # seed + i would let neighbouring seeds share environments; a SeedSequence's words do not.
+
+    def make_env():
+        return GridWorldEnv(action_pool, num_available, **options)
+
+    envs = SyncVectorEnv([make_env] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    # Gymnasium would seed environment i with seed + i, so runs with seeds 0 and 1 would share all
+    # environments but one. SeedSequence gives unrelated seeds.
     envs.reset(seed=np.random.SeedSequence(seed).generate_state(num_envs).tolist())
     return envs
 
 
 # ---- A.1 Action Observations: the play world ----
+# For hvae.py. Of a recording of what a skill does, the first state is scaled from 0..79 to -1..1,
+# (cell - centre) / half_width; later states are differences in cells (step). Why cells: the least
+# standard deviation of the decoder is 0.135 [code], so a move of 1 is about 7 of them. In scaled
+# coordinates a move would be 0.025, lost in the noise.
+UNITS = dict(centre=39.5, half_width=39.5, step=1.0)
 
 
 def action_observations(action_ids, num_observations=1024, modality="xy", seed=0, workers=1):
@@ -299,173 +322,199 @@ def action_observations(action_ids, num_observations=1024, modality="xy", seed=0
 
     Returns uint8 (len(action_ids), num_observations, 6, 2): the cell (x, y), 1..78, before the
     skill and after each move. E.g. UUURD from (3, 2): (3, 2) (3, 1) (3, 1) (3, 1) (4, 1) (4, 2).
-    "onehot" is the same numbers: the encoder expands them to 80 + 80 zeros and ones per state.
-
-    A skill's recordings depend on (seed, id) only. `workers` is ignored: all takes a second.
-    ValueError for ids that are unknown or repeated, an unknown modality, no observations.
+    "onehot" is the same numbers: hvae.py expands them to 80 + 80 zeros and ones per state.
+    A skill's recordings depend on (seed, id) only. `workers` is for slower environments; here it is
+    ignored. ValueError for an unknown modality and for ids that are unknown or repeated.
     """
     if modality not in MODALITIES:
-        raise ValueError(f"modality {modality!r} is unknown; there are {', '.join(MODALITIES)}")
-    if num_observations < 1:
-        raise ValueError(f"num_observations is {num_observations}, at least 1")
-    action_ids = check_ids(action_ids)
+        raise ValueError(f"modality {modality!r} is unknown; there are {MODALITIES}")
+    check_ids(action_ids)
+    action_ids = np.asarray(action_ids)  # in the order of the caller
+
+    # A start for every recording, anywhere. In [code] a goal was left over at (78, 78), which cut
+    # recordings short; [here] there is none, because A.1 says "no obstacles".
     paths = np.empty((len(action_ids), num_observations, SKILL_LENGTH + 1, 2), np.int8)
     for i, action in enumerate(action_ids):
         rng = np.random.default_rng([seed, action])
-        # published code: a goal was left over on (78, 78) and cut recordings short; we have none.
         paths[i, :, 0] = rng.integers(PLAY_LOW, PLAY_HIGH + 1, (num_observations, 2))
+
+    # All recordings move at once, as int8, because a move can be -1. Clipping keeps an agent that
+    # would walk into the wall where it is.
     deltas = MOVE_DELTAS.astype(np.int8)[SKILL_MOVES[action_ids]]  # (A, 5, 2)
     for t in range(SKILL_LENGTH):
         after = paths[:, :, t] + deltas[:, None, t]  # (A, n, 2) + (A, 1, 2)
-        paths[:, :, t + 1] = after.clip(PLAY_LOW, PLAY_HIGH)  # a bump at the wall: it stays
-    return paths.view(np.uint8)
+        paths[:, :, t + 1] = after.clip(PLAY_LOW, PLAY_HIGH)
+    return paths.view(np.uint8)  # the same bytes: all are 1..78
 
 
 # ---- pictures for people (Figure 1) ----
+COLORS = {
+    EMPTY: "#17191d",
+    WALL: "#6f7378",
+    GOAL: "#35b44a",
+    LAVA: "#f5821f",
+    SUBGOAL: "#2f6fe4",
+    AGENT: "#ee2b2b",
+}
+QUADRANTS = {  # B, Figure 4: upper right is red
+    "upper right": "tab:red",
+    "upper left": "tab:green",
+    "lower left": "tab:blue",
+    "lower right": "tab:orange",
+}
 
-CELL = 160  # ours: drawn 4 times larger, then averaged down: smooth edges
-COLORS = {EMPTY: "#17191d", WALL: "#6f7378", GOAL: "#35b44a",
-          LAVA: "#f5821f", SUBGOAL: "#2f6fe4", AGENT: "#ee2b2b"}  # fmt: skip
-LINE, TRAIL, KEY, TEXT, DIM, WAVE = "#3c4046", "#8f2c2c", "#2a2d33", "#f2f2f2", "#80858c", "#a94a06"
 
-
-def draw_frame(env: GridWorldEnv, done: int) -> np.ndarray:
-    """Figure 1 after `done` moves of the last skill, the state beside: uint8 (420, 600, 3).
-
-    The policy looks between skills only: in its state the agent is where the skill began.
-    """
+def draw_frame(env: GridWorldEnv, moves: int) -> np.ndarray:
+    """As in Figure 1, after `moves` moves; beside it the state: uint8 (420, 600, 3)."""
+    # Drawn four times too large and averaged down, for smooth edges: a grid cell has 160 pixels.
     image = Image.new("RGB", (2400, 1680), COLORS[EMPTY])
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(60)
-    draw.rectangle((1444, 0, 2400, 1680), KEY)
-    draw.text((1920, 256), "what the policy saw: 81 ids", TEXT, font, "mm")
+    draw = ImageDraw.Draw(image)
+    draw.font = ImageFont.load_default(60)
+
+    # Left: the grid. Right: the ids the policy saw, with the agent where the skill began.
+    draw.rectangle((1444, 0, 2400, 1680), "#f4f4f2")
+    draw.text((1920, 256), "what the policy saw: 81 ids", COLORS[EMPTY], anchor="mm")
     for cell, kind in enumerate(env.grid):
-        column, row = divmod(cell, SIZE)
-        x, y = column * CELL, row * CELL
-        draw.rectangle((x, y, x + CELL, y + CELL), COLORS[kind], LINE, 4)
-        for height in (48, 80, 112) if kind == LAVA else ():
-            draw.line([(x + 16 + 32 * i, y + height - 8 * (-1) ** i) for i in range(5)], WAVE, 8)
-        x, y = 1536 + column * 96, 416 + row * 96
-        draw.rectangle((x - 48, y - 48, x + 48, y + 48), COLORS[EMPTY], LINE, 4)
-        seen = AGENT if cell == env.trace[0] else kind
-        draw.text((x, y), str(seen), DIM if seen in (EMPTY, WALL) else COLORS[seen], font, "mm")
-    path = np.array([divmod(c, SIZE) for c in env.trace[: done + 1]]) * CELL + 80.0  # (done + 1, 2)
-    draw.line(path.ravel().tolist(), TRAIL, 16, "curve")
-    for x, y in path[:-1]:
-        draw.ellipse((x - 20, y - 20, x + 20, y + 20), TRAIL)
-    # A triangle as in Figure 1. Pillow's first one points up and turns against the clock.
-    heading = int(SKILL_MOVES[env.skill, done - 1]) if done else 0
-    draw.regular_polygon((*path[-1], 64), 3, -90 * (heading + 1), COLORS[AGENT], "#5c0d0d", 4)
-    for t, letter in enumerate(SKILL_NAMES[env.skill] if done else " " * SKILL_LENGTH):
-        x, y = 120 + 148 * t, 1560
-        fill = COLORS[AGENT] if t == done - 1 else KEY  # the present move is lit
-        draw.rounded_rectangle((x - 64, y - 64, x + 64, y + 64), 24, fill, LINE, 4)
-        draw.text((x, y), letter, TEXT if t < done else DIM, font, "mm")
-    moves = env.moves - len(env.trace) + 1 + done
-    draw.text((1384, 1524), f"move {moves} / {MAX_MOVES}", TEXT, font, "rm")
-    kind = env.grid[env.trace[done]]
-    word = {SUBGOAL: "subgoal", GOAL: "goal reached", LAVA: "lava"}.get(kind, "")
-    draw.text((1384, 1600), word, COLORS[kind], font, "rm")
+        x, y = divmod(cell, SIZE)
+        corners = (160 * x, 160 * y, 160 * x + 160, 160 * y + 160)
+        draw.rectangle(corners, COLORS[kind], "#3c4046", 4)
+        seen = AGENT if cell == env.trace[env.skill_start] else kind
+        draw.text((1536 + 96 * x, 416 + 96 * y), str(seen), COLORS[seen], anchor="mm")
+
+    # The way so far, and the agent. The triangle of Figure 1 shows no heading: moves are absolute.
+    path = []
+    for cell in env.trace[: moves + 1]:
+        x, y = divmod(cell, SIZE)
+        path.append((160 * x + 80, 160 * y + 80))
+    draw.line(path, "#8f2c2c", 24, "curve")
+    x, y = path[-1]
+    draw.regular_polygon((x, y, 64), 3, 0, COLORS[AGENT], "#5c0d0d", 4)
+
+    # Below: the skill, its moves still to come in grey, and the moves of the episode so far.
+    if env.skill is not None:
+        done = moves - env.skill_start
+        for t, letter in enumerate(SKILL_NAMES[env.skill]):
+            color = "white" if t < done else "gray"
+            draw.text((120 + 100 * t, 1560), letter, color, anchor="mm")
+    draw.text((1384, 1560), f"move {moves} / {MAX_MOVES}", "white", anchor="rm")
     return np.array(image.reduce(4))
 
 
-def draw_sheet(path: Path, pool: np.ndarray, seed: int) -> None:
-    """One picture: the layouts, where skills lead, recordings of one skill of each quadrant."""
-    # An inherited backend (a notebook's) that is not installed would make the import fail.
+def draw_sheet(path: Path, skills: np.ndarray, seed: int) -> None:
+    """A PNG: the layouts, where skills lead, recordings of one of `skills` per quadrant."""
+    # Imported here: training needs no pictures. A notebook's backend could make the import fail.
     os.environ.pop("MPLBACKEND", None)
-    from matplotlib.figure import Figure  # here: training needs no pictures
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
 
-    figure, labels = Figure((15, 6), layout="constrained"), action_labels()
+    figure = Figure((15, 6), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
-    palette = np.full((SUBGOAL + 1, 3), 255)  # by cell id; between the layouts (id 0) white
-    palette[list(COLORS)] = [ImageColor.getrgb(color) for color in COLORS.values()]
-    boards = np.pad(LAYOUTS.reshape(6, 7, SIZE, SIZE), ((0, 0), (0, 0), (1, 1), (1, 1)))
-    # (6 rows, 7 columns, x, y) -> (rows, y, columns, x): one picture
-    left.imshow(palette[boards.transpose(0, 3, 1, 2).reshape(6 * 11, 7 * 11)])
+    # Six rows of seven layouts, in one picture.
+    boards = LAYOUTS.reshape(6, 7, SIZE, SIZE).transpose(0, 3, 1, 2)  # (rows, y, columns, x)
+    palette = ListedColormap([COLORS.get(kind, "white") for kind in range(SUBGOAL + 1)])
+    left.imshow(boards.reshape(6 * SIZE, 7 * SIZE), palette, vmin=0, vmax=SUBGOAL)
     left.set(title="the 42 layouts", xticks=[], yticks=[])
+    labels = action_labels()
     for quadrant, color in QUADRANTS.items():
         ends = MOVE_DELTAS[SKILL_MOVES[labels == quadrant]].sum(1)  # (256, 2)
         cells, counts = np.unique(ends, axis=0, return_counts=True)
         middle.scatter(*cells.T, 7 * counts, color)
-        skill = pool[labels[pool] == quadrant][0]
+        skill = skills[labels[skills] == quadrant][0]
         paths = action_observations([skill], 40, seed=seed)[0]  # (40, 6, 2)
         right.plot(*paths.T, color=color)
         right.scatter(*paths[:, 0].T, 12, color, label=SKILL_NAMES[skill])
     middle.set(title="where all skills lead (area: how many)", aspect="equal", ylim=(5.5, -5.5))
     right.set(title="recordings (dot: start)", aspect="equal", xlim=(0, 79), ylim=(79, 0))
     figure.legend(loc="outside lower right", ncols=4)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    figure.savefig(temporary, format="png")
-    temporary.replace(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
 
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
-    """Write frames (H, W, 3) uint8 as an endless GIF, whole or not at all."""
-    images = [Image.fromarray(frame) for frame in frames]
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    duration = round(1000 / fps)  # ms
-    images[0].save(
-        temporary, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0
+    """Write pictures (h, w, 3) uint8 as a GIF that rests on its last picture.
+
+    The file appears whole or not at all.
+    """
+    data = io.BytesIO()
+    pictures = [Image.fromarray(frame) for frame in frames]
+    durations = [round(1000 / fps)] * len(pictures)  # ms
+    durations[-1] = 2000  # so that the end can be seen
+    pictures[0].save(
+        data, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
     )
-    temporary.replace(path)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    try:
+        Path(path).write_bytes(data.getvalue())
+    except OSError:
+        Path(path).unlink(missing_ok=True)
+        raise
 
 
 # ---- the script ----
-
-
 def best_plan(layout: int, available: Sequence[int]) -> list[int]:
     """Positions in `available` that reach the goal in the fewest moves; [] if none do."""
-    grid, seen = LAYOUTS[layout].tolist(), set()
-    queue = [(0, START, [])]  # (moves made, cell, plan), the fewest moves first: Dijkstra
+    # Dijkstra's search: always go on from the cell that was reached in the fewest moves.
+    grid = LAYOUTS[layout].tolist()
+    visited = set()
+    queue = [(0, START, [])]  # (moves made, cell, plan that leads there)
     while queue:
         moves, cell, plan = heapq.heappop(queue)
         if grid[cell] == GOAL:
             return plan
-        if grid[cell] == LAVA or cell in seen or moves >= MAX_MOVES:
+        if grid[cell] == LAVA or cell in visited or moves >= MAX_MOVES:
             continue
-        seen.add(cell)
+        visited.add(cell)
         for position, skill in enumerate(available):
             cells = walk(grid, cell, skill)
             heapq.heappush(queue, (moves + len(cells), cells[-1], [*plan, position]))
     return []
 
 
+def play(env: GridWorldEnv, plan: Sequence[int]) -> list[np.ndarray]:
+    """Carry out `plan` until the episode ends, tell it as text, and return its pictures."""
+    frames = env.render_frames()
+    for action in plan:
+        _, reward, terminated, truncated, _ = env.step(action)
+        frames += env.render_frames()
+        cell = divmod(env.trace[-1], SIZE)
+        name = SKILL_NAMES[env.skill]
+        print(f"    {name} to {cell}, move {len(env.trace) - 1}, reward {reward:.3f}")
+        if terminated or truncated:
+            break
+    return frames
+
+
 @dataclass
 class Args:
-    pool: Literal["train", "valid", "test"] = "test"  # skills to draw from
-    num_available: int = NUM_AVAILABLE  # skills on offer in an episode (Table 3)
-    seed: int = 0  # of the split, the layout and the skills on offer
+    part: Literal["train", "valid", "test"] = "test"  # part of the split that skills come from
+    num_available: int = NUM_AVAILABLE  # skills that are available in an episode (Table 3)
+    seed: int = 0  # of the split, the layout and the available skills, 0 or more
     out: Path = Path("runs/demo")  # folder for the pictures
 
 
 def main(args: Args) -> None:
     """One episode planned and one at random, as text and GIF; a picture of the action set."""
-    pool = split_actions(seed=args.seed)[args.pool]
-    env = GridWorldEnv(pool, args.num_available, "rgb_array")
-    for name in ("planned", "random"):
-        env.reset(seed=args.seed)
-        plan = best_plan(env.layout, env.available)  # empty where nothing leads to the goal
-        if name == "random":
-            plan = env.np_random.integers(args.num_available, size=MAX_SKILLS)
-        frames = env.render_frames()
-        for action in plan:
-            _, reward, terminated, truncated, _ = env.step(action)
-            frames += env.render_frames()
-            end = divmod(env.trace[-1], SIZE)
-            print(f"{name}: {SKILL_NAMES[env.skill]} to {end}, move {env.moves}, {reward:.3f}")
-            if terminated or truncated:
-                break
-        frames += frames[-1:] * 5  # one second more to see the outcome
-        save_gif(args.out / f"gridworld_{name}.gif", frames, env.metadata["render_fps"])
-    solved = sum(bool(best_plan(layout, env.available)) for layout in range(len(LAYOUTS)))
-    print(f"the {args.num_available} skills on offer solve {solved} of {len(LAYOUTS)} layouts")
-    draw_sheet(args.out / "gridworld_sheet.png", pool, args.seed)
+    try:
+        skills = split_actions(seed=args.seed)[args.part]
+        env = GridWorldEnv(skills, args.num_available, "rgb_array")
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+    fps = env.metadata["render_fps"]
+    # The plan is made by a search that knows the grid and what skills do.
+    print("planned:")
+    env.reset(seed=args.seed)
+    plan = best_plan(env.layout, env.available)
+    if not plan:
+        print("    none: the available skills do not lead to the goal")
+    save_gif(args.out / "gridworld_planned.gif", play(env, plan), fps)
+
+    print("random:")
+    env.reset(seed=args.seed)  # the same layout and the same skills again
+    plan = env.np_random.integers(args.num_available, size=MAX_SKILLS)
+    save_gif(args.out / "gridworld_random.gif", play(env, plan), fps)
+    draw_sheet(args.out / "gridworld_sheet.png", skills, args.seed)
     print(f"wrote gridworld_planned.gif, gridworld_random.gif, gridworld_sheet.png to {args.out}")
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except (ValueError, OSError) as e:
-        raise SystemExit(f"error: {e}") from None
+    main(tyro.cli(Args))

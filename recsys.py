@@ -1,8 +1,9 @@
 """Recommender System: a simulated user and 10,000 products (appendix A.2 and C.5).
 
 The agent recommends one product after another to a user and earns 1 for every click. It sees the
-user as a vector of 16 numbers and every product as another one; it does not see how popular a
-product is. Every episode offers 500 products; at test time none of them was used in training.
+user as a vector of 16 numbers and each product as another vector of 16 numbers; it does not see how
+popular a product is. In every episode 500 products are available; at test time none of them was
+used in training. What is reported is the click-through rate (CTR): clicks / recommendations.
 
       reset                   0.05, and after every click
         |                    +---------------------------+
@@ -13,25 +14,19 @@ product is. Every episode offers 500 products; at test time none of them was use
                          v                                v
                         gone                             gone
 
-Each draw also moves the user vector a little. After 100 recommendations the episode ends, too.
+The numbers are probabilities of the next session. It is drawn after every recommendation and after
+every page viewed in an organic session; each draw also moves the user vector a little. After 100
+recommendations the episode ends, too.
 
-Commands:
+    python recsys.py                    # one episode as text and GIF, the click curve (8 s)
+    python recsys.py --policy oracle --part train --num-available 50 --seed 3
+    python recsys.py --episodes 10000   # what simple policies reach, as quoted at POLICIES (3 min)
 
-    python recsys.py                    # one episode as text and GIF, the click curve (6 s)
-    python recsys.py --policy oracle --pool train --num-available 50 --seed 3
-    python recsys.py --episodes 10000   # floors and ceilings as quoted at POLICIES (1 min)
-
-Paper map (appendix -> here):
-
-    A.2 Actions, action set split    PRODUCTS, POPULARITY, split_actions
-    C.5 Fully observable             engineered_representations(fully_observable=True)
-    A.2 Click, Eq. 2                 click_probability
-    A.2 Sessions (Figure 2)          TRANSITIONS, RecSysEnv._transition, _organic_session
-    A.2 State, reward, episode end   RecSysEnv.reset, RecSysEnv.step
+The sections bear A.2's names, in another order. Two marks: [code] is the authors' released
+implementation, used where the appendix is silent; [here] is this repository's choice, with reason.
 """
 
-import functools
-import operator
+import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,34 +36,45 @@ from typing import Literal
 import gymnasium as gym
 import numpy as np
 import tyro
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from PIL import Image
 
 # ---- constants (each with its source) ----
 NUM_ACTIONS = 10_000  # A.2 "a total of 10,000 actions (products)"
 DIM = 16  # A.2, Table 3: size of the user vector and of a product vector
-METRIC = "ctr"  # A.2: click-through rate, clicks / recommendations of one episode
-MODALITIES: tuple[str, ...] = ()  # A.2: nothing to observe
 NUM_AVAILABLE = 500  # Table 3 "actions per episode"
 MAX_RECOMMENDATIONS = 100  # A.2, Table 3 "max. episode length"
-EQ_2 = (14.0, 2.0, 0.3, 2.0, 6.0)  # a, b, c, d, e of Eq. 2; this c is not a product
 SIGMA_1 = 0.1  # A.2: scale of one perturbation of the user
-MU_STD = 3.0  # published code; the appendix does not say how mu_i is distributed
-ORGANIC, BANDIT, GONE = range(3)  # A.2 names the first two; in the last the user has left
-PAGE_VIEW = -1  # in place of a product id: the user looks at something unknown
-# Published code; the appendix gives no numbers. Rows: now, columns: next.
-TRANSITIONS = np.array([[0.74, 0.25, 0.01], [0.05, 0.94, 0.01], [0.0, 0.0, 1.0]])
+MU_STD = 3.0  # [code]; the appendix does not say how mu_i is distributed
+
+# Read by the other files. In each tuple the first entry is the default; an empty tuple: none.
+METRIC = "ctr"  # A.2: click-through rate, clicks / recommendations of one episode
+SPLITS = ("default",)  # A.2
+MODALITIES = ()  # A.2: nothing to observe, products come with engineered representations
+
+# A.2 names the first two sessions; in the third the user has left. Probabilities of the next
+# session (column) given the present one (row): [code], the appendix has no numbers.
+ORGANIC, BANDIT, GONE = 0, 1, 2
+TRANSITIONS = np.array(
+    [
+        [0.74, 0.25, 0.01],  # from organic
+        [0.05, 0.94, 0.01],  # from bandit
+        [0.00, 0.00, 1.00],  # from gone
+    ]
+)
 CUMULATIVE = TRANSITIONS.cumsum(1)  # (3, 3), for drawing the next session
 
-# ---- A.2 Actions: the products, drawn once for every environment, seed and method ----
-
-# A key of nine words, which no seed of an environment has: no user is drawn like a product. ours:
-# 21 is the first that brings the mean mu of training, validation and test products (split 0)
-# within 0.03 of 0 (the ceilings depend on it).
+# ---- A.2 Actions and action set split ----
+# Products are the same in every run. Their seed, a list, cannot equal a user's, a single integer.
+# [here] 21 is the first number with which the mean mu_i of training, validation and test products
+# of split seed 0 all lie within 0.03 of 0, so that scores of the parts can be compared. Other split
+# seeds are not balanced.
 _rng = np.random.default_rng([*b"products", 21])
 PRODUCTS = _rng.standard_normal((NUM_ACTIONS, DIM))  # c_i
-# appendix: c ~ N(0, I), length about 4; published code: scaled to length 1; we do the latter,
-# because with length 4 the taste c.v swamps the hidden mu, and partial observability is gone.
+
+# appendix: c ~ N(0, I), of length about 4; [code] scaled to length 1, and so [here]. For a user v,
+# call c_i . v the *taste* for product i, and mu_i its *popularity*. With length 4, taste (std 4)
+# would outweigh popularity (std 3), and little would be hidden; with length 1 its std is 1.
 PRODUCTS /= np.linalg.norm(PRODUCTS, axis=1, keepdims=True)
 POPULARITY = _rng.normal(0.0, MU_STD, NUM_ACTIONS)  # mu_i, hidden from the agent
 
@@ -85,78 +91,70 @@ def engineered_representations(fully_observable: bool = False) -> np.ndarray:
     """
     if not fully_observable:
         return PRODUCTS.astype(np.float32)
-    # appendix: mu_i is concatenated to c_i; published code: as it is (std 3, beside components of
-    # std 0.25); we divide by its std, so that one input does not drown the other sixteen.
+    # appendix: mu_i is concatenated to c_i; [code] as it is (std 3, beside components of std
+    # 0.25); [here] divided by its std, so that one input does not drown the other sixteen.
     return np.column_stack([PRODUCTS, POPULARITY / MU_STD]).astype(np.float32)
 
 
-def action_observations(action_ids, num_observations, modality, seed=0, workers=1) -> np.ndarray:
-    """ValueError: products come with engineered vectors (A.2)."""
+def action_observations(action_ids, num_observations, modality, seed=0, workers=1):
+    """ValueError: products come with engineered vectors (A.2). Here only for the same interface."""
     raise ValueError("recsys has no action observations; use engineered_representations()")
 
 
 def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray]:
-    """Cut the products at random 2:1:1 (A.2) into sorted ids "train", "valid", "test".
+    """Cut the products at random 2:1:1 (A.2) into "train", "valid", "test".
 
-    5,000 / 2,500 / 2,500 ids. ValueError for any split but "default".
+    5,000 / 2,500 / 2,500 sorted ids, disjoint. ValueError for any split but "default".
     """
-    if split != "default":
-        raise ValueError(f"split={split!r} is unknown; recsys has only 'default'")
+    if split not in SPLITS:
+        raise ValueError(f"split {split!r} is unknown; recsys has only 'default'")
     order = np.random.default_rng(seed).permutation(NUM_ACTIONS)
-    parts = np.split(order, [NUM_ACTIONS // 2, NUM_ACTIONS * 3 // 4])
-    return dict(zip(("train", "valid", "test"), map(np.sort, parts), strict=True))
+    train, valid, test = np.split(order, [5_000, 7_500])
+    return dict(train=np.sort(train), valid=np.sort(valid), test=np.sort(test))
 
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
-    """`ids` (n,) as integers; ValueError unless distinct, known, and enough to offer so many."""
-    ids = np.asarray(ids)
+    """`ids` as a sorted int64 array (m,).
+
+    ValueError unless they are distinct, known, and m >= num_available >= 1.
+    """
+    ids = np.sort(np.asarray(ids))
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
+    if len(ids) == 0 or ids[0] < 0 or ids[-1] >= NUM_ACTIONS:
+        raise ValueError(f"action ids must lie in 0..{NUM_ACTIONS - 1}")
     if not 1 <= num_available <= len(ids):
-        raise ValueError(
-            f"{num_available} actions on offer out of {len(ids)}: from 1 to {len(ids)}"
-        )
-    if not 0 <= ids.min() <= ids.max() < NUM_ACTIONS:
-        raise ValueError(f"action ids lie in 0..{NUM_ACTIONS - 1}, got {ids.min()}..{ids.max()}")
+        raise ValueError(f"{num_available} available actions out of a pool of {len(ids)}")
     return ids.astype(np.int64)
 
 
 # ---- A.2 the environment: click, sessions, state, reward ----
-
-
 def click_probability(x: np.ndarray) -> np.ndarray:
     """Eq. 2: f(x) for x = c_i . v_user + mu_i, any shape. Between 0.0130 and 0.7311."""
 
     def sigmoid(y):
         return 1.0 / (1.0 + np.exp(-y))
 
-    a, b, c, d, e = EQ_2
-    return sigmoid(a * sigmoid(b * sigmoid(c * x) - d) - e)
+    # With the constants of Eq. 2: a = 14, b = 2, c = 0.3 (which is not a product), d = 2, e = 6.
+    return sigmoid(14.0 * sigmoid(2.0 * sigmoid(0.3 * x) - 2.0) - 6.0)
 
 
 class RecSysEnv(gym.Env):
     """A user who is shown one product after another (appendix A.2).
 
-    ## Description
     The user is a vector v of 16 numbers and is in an organic session (looks around alone), in a
-    bandit session (is shown a recommendation), or gone; see TRANSITIONS. Every draw of the next
-    session, also one that changes nothing, perturbs the user: v + 0.1 |z| n with a scalar
-    z ~ N(0, 1) and n ~ N(0, I). A click overrides it: the user goes organic, even if the draw
-    said gone. Product i is clicked with probability f(c_i . v + mu_i) (Eq. 2), c_i of length 1,
-    mu_i ~ N(0, 3^2): popularity outweighs taste, and c_i does not tell it.
+    bandit session (is shown a recommendation), or gone.
 
     ## Action Space
-    `Discrete(K)`: a position in the `available` array of the last observation.
+    `Discrete(K)`: a position in `available`.
 
     ## Observation Space
-    `Dict` of
-    | key | space | meaning |
-    |---|---|---|
-    | state | Box(-100, 100, (16,), float32) | the user vector v |
-    | available | Box(0, 9999, (K,), int64) | ids of the products on offer in this episode |
+    `Dict(state=Box(-100, 100, (16,), float32), available=Box(0, 9999, (K,), int64))`: the user
+    vector v, and the ids of the K products that are available in this episode.
 
     ## Rewards
-    1 for a click, else 0.
+    1 for a click, else 0. Product i is clicked with probability f(c_i . v + mu_i) (Eq. 2), c_i of
+    length 1, mu_i ~ N(0, 3^2): popularity outweighs taste, and c_i has no information about mu_i.
 
     ## Starting State
     v ~ N(0, I); an organic session runs before the first observation. `available` is drawn
@@ -164,309 +162,359 @@ class RecSysEnv(gym.Env):
 
     ## Episode End
     `terminated` when the user leaves (0.0119 per recommendation without click, 0.0385 after a
-    click), `truncated` after 100. The last info holds `ctr`: clicks / recommendations.
+    click; who leaves before the first one still gets it), `truncated` after 100. The last info
+    holds `ctr`: clicks / recommendations, the mean reward of a step.
 
     ## Arguments
-    `action_pool`: distinct ids that `available` is drawn from (default: training).
-    `num_available`: K (default 500, Table 3). `render_mode`: None or "rgb_array".
-    ValueError for unknown or repeated ids, fewer than K of them, or K < 1.
+    `action_pool`: distinct ids that `available` is drawn from (default: training products).
+    `num_available`: K (Table 3: 500). `render_mode`: None or "rgb_array".
+    ValueError for a pool, K, action or render_mode that does not exist.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
 
     def __init__(self, action_pool=None, num_available=NUM_AVAILABLE, render_mode=None):
-        pool = split_actions()["train"] if action_pool is None else action_pool
-        self.action_pool = np.sort(check_ids(pool, num_available))
-        self.num_available = num_available
+        if action_pool is None:
+            action_pool = split_actions()["train"]
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode is None or 'rgb_array', got {render_mode!r}")
+            raise ValueError(f"render_mode {render_mode!r} is unknown; there is 'rgb_array'")
+        self.action_pool = check_ids(action_pool, num_available)
+        self.num_available = num_available
         self.render_mode = render_mode
         self.observation_space = gym.spaces.Dict(
-            # appendix: v_user; published code: v_user / norm, then running mean and std; we show
-            # v_user and leave scaling to the learner. 100 is ours: a bound that is never met.
+            # appendix: v_user; [code] v_user / norm, then running mean and std; [here] v_user, for
+            # the learner to scale. [here] 100: never met, but gymnasium warns of unbounded spaces.
             state=gym.spaces.Box(-100, 100, (DIM,), np.float32),
             available=gym.spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
         )
         self.action_space = gym.spaces.Discrete(num_available)
-        self.ending = "not started"  # why there is nothing to step; "" during an episode
+        self.ending = "not started"  # why there is nothing to step in; "" during an episode
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
+    def reset(self, *, seed=None, options=None):
         """A new user, who looks around alone first; returns (observation, {})."""
-        super().reset(seed=None if seed is None else operator.index(seed))  # numpy, too
-        offer = self.np_random.choice(self.action_pool, self.num_available, replace=False)
-        self.available = np.sort(offer)  # with the whole pool on offer a position is a product
-        self.user = self.np_random.standard_normal(DIM)
-        self.recommendations = self.clicks = 0
-        self.timeline = []  # for pictures: (user, product or PAGE_VIEW, click)
+        super().reset(seed=seed)
+
+        # Every episode has its own random subset of the pool: the paper's *subsampling*. Sorted,
+        # so that with the whole pool a position always means the same product.
+        drawn = self.np_random.choice(self.action_pool, self.num_available, replace=False)
+        self.available = np.sort(drawn)
+        self.user = self.np_random.standard_normal(DIM)  # A.2: v_user ~ N(0, I)
+
+        # The episode so far: for every recommendation the user vector, the position chosen and
+        # whether it was clicked; and how many products the user looked at alone before the first
+        # recommendation and after each.
+        self.users = []
+        self.choices = []
+        self.clicks = []
+        self.page_views = [0]
         self.ending = ""
-        # appendix: silent; published code: does not notice a user who leaves in this first session
-        # (1 in 26). One recommendation is still made, and a click brings the user back. We keep
-        # that, because the published scores contain it.
+
+        # [code] does not notice a user who leaves in this first session (1 in 26). One
+        # recommendation is still made, and a click brings the user back. [here] the same, because
+        # the scores of the paper contain it.
         self.session = ORGANIC
         self._organic_session()
         return self._observe(), {}
 
-    def step(self, action: int):
+    def step(self, action):
         """Recommend one product; returns (observation, reward, terminated, truncated, info)."""
         if self.ending:
-            raise gym.error.ResetNeeded("call reset() before step()")
+            raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
         if not self.action_space.contains(action):
-            raise ValueError(f"action must be 0..{self.num_available - 1}, got {action}")
-        # The user clicks with the taste that the agent has seen; v changes only afterwards.
-        # appendix: repeats are unlikely to be clicked, as the user drifts; published code: no
-        # rule against it; we add none. The drift is slow: repeating the product that was best at
-        # first scores as well as the oracle, within 0.01.
-        product = int(self.available[action])
-        x = PRODUCTS[product] @ self.user + POPULARITY[product]
-        click = bool(self.np_random.random() < click_probability(x))
-        self.timeline.append((self.user, product, click))
+            raise ValueError(f"action is {action!r}; there are 0..{self.num_available - 1}")
 
+        # Click or not (Eq. 2), with the user vector that the agent has seen: it changes afterwards.
+        # The appendix says that a product is unlikely to be clicked twice, because the user drifts.
+        # [code] has no rule against repeats, nor is there one here. Popularity
+        # outweighs taste: repeating the first best product reaches the oracle's CTR (the tests).
+        product = self.available[action]
+        x = PRODUCTS[product] @ self.user + POPULARITY[product]  # (16,) @ (16,) -> ()
+        click = bool(self.np_random.random() < click_probability(x))
+        self.users.append(self.user)
+        self.choices.append(int(action))
+        self.clicks.append(click)
+        self.page_views.append(0)
+
+        # Next session. [code]: a click always leads to an organic session, even if "gone" was drawn
+        # (A.2 says only "can transition"). An organic session then runs until the user is back in
+        # the bandit session, or gone.
         self._transition()
         if click:
-            self.session = ORGANIC  # published code: overrides the draw (A.2: "can transition")
+            self.session = ORGANIC
         self._organic_session()
 
-        self.recommendations += 1
-        self.clicks += click
+        # End (A.2): the user left, or the limit. [code] treats both alike, as a learner may here,
+        # too; [here] the limit is `truncated`, gymnasium's word for an end that only a clock makes.
         terminated = self.session == GONE
-        # published code: the limit is a true end; we report `truncated`, the learner decides.
-        truncated = not terminated and self.recommendations == MAX_RECOMMENDATIONS
+        truncated = not terminated and len(self.clicks) == MAX_RECOMMENDATIONS
         info = {}
         if terminated or truncated:
             self.ending = "the user left" if terminated else "time is up"
-            info = {METRIC: self.clicks / self.recommendations}
+            info = {METRIC: sum(self.clicks) / len(self.clicks)}
+        # Reward (A.2): 1 for a click.
         return self._observe(), float(click), terminated, truncated, info
 
-    def _transition(self) -> None:
+    def _transition(self):
         """Draw the next session and perturb the user."""
-        # appendix: perturbed after each step; published code: after every draw, page views of an
-        # organic session included; we do the latter.
-        # A bisection is seven times as fast as choice(3, p=...), which checks p anew every time.
-        # "right": a draw of exactly 0 must not reach a session of probability 0.
-        row, u = CUMULATIVE[self.session], self.np_random.random()
-        self.session = int(row.searchsorted(u, side="right"))
-        # appendix: covariance sigma_1 sigma_2 I with sigma_2 ~ N(0, 1), negative half of the time;
-        # published code: standard deviation 0.1 |sigma_2|; we do the latter, because a covariance
-        # cannot be negative. One sigma_2 for all 16 dimensions.
+        # u is uniform in [0, 1). The next session is the number of cumulative probabilities that
+        # are at most u; searchsorted counts them.
+        u = self.np_random.random()
+        self.session = int(CUMULATIVE[self.session].searchsorted(u, side="right"))
+
+        # Perturb after every draw, even if the session stays the same: [code], and Figure 2 ("Each
+        # transition updates the user vector"). A.2's "after each step" could be per recommendation.
+        # appendix: covariance sigma_1 sigma_2 I with sigma_2 ~ N(0, 1), which is negative half of
+        # the time; [code] standard deviation 0.1 |sigma_2|, and so [here], because a covariance
+        # cannot be negative. All 16 dimensions share one sigma_2.
         sigma_2 = self.np_random.standard_normal()
         noise = self.np_random.standard_normal(DIM)
-        # Not +=: the timeline keeps the old array.
-        self.user = self.user + SIGMA_1 * abs(sigma_2) * noise
+        self.user = self.user + SIGMA_1 * abs(sigma_2) * noise  # a new array: `users` keeps the old
 
-    def _organic_session(self) -> None:
-        # Which products the user looks at is never observed; only the number of views matters.
+    def _organic_session(self):
+        # A page view is one product that the user looks at alone. Which one is never observed; only
+        # the number of page views matters, because each perturbs the user.
         while self.session == ORGANIC:
             self._transition()
-            self.timeline.append((self.user, PAGE_VIEW, False))
+            self.page_views[-1] += 1
 
-    def _observe(self) -> dict[str, np.ndarray]:
+    def _observe(self):
+        # State (A.2): the user vector. It does not tell what has been clicked.
         return {"state": self.user.astype(np.float32), "available": self.available.copy()}
 
-    def render(self) -> np.ndarray | None:
+    def render(self):
         """The episode so far: uint8 (480, 900, 3); None without a render_mode."""
-        if self.ending == "not started":
-            raise gym.error.ResetNeeded("call reset() before render()")
-        if self.render_mode == "rgb_array":
-            return draw_timeline(self.available, self.timeline, self.ending)
+        return draw_episode(self, len(self.clicks)) if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step: one; nothing moves between two recommendations."""
+        """Pictures of the last step: one; nothing moves in between. [] without a render_mode."""
         return [self.render()] if self.render_mode else []
 
 
-gym.register("ActionGen/RecSys-v0", entry_point=f"{__name__}:RecSysEnv")
+gym.register("ActionGen/RecSys-v0", entry_point="recsys:RecSysEnv")
 
 
 def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **options):
-    """A SyncVectorEnv of users with independent random streams, SAME_STEP autoreset.
+    """A SyncVectorEnv of RecSysEnv(action_pool, num_available, **options), which are seeded.
 
-    A reset() without a seed goes on with the streams. ValueError as in `RecSysEnv`.
+    SAME_STEP: the step that ends an episode returns the first observation of the next one, and
+    infos["final_info"] holds `ctr`. Call `envs.reset()` without a seed, which would replace
+    `seed`. ValueError as in RecSysEnv.
     """
-    one = functools.partial(RecSysEnv, action_pool, num_available, **options)
-    envs = gym.vector.SyncVectorEnv([one] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-    # seed + i would let neighbouring seeds share environments; a SeedSequence's words do not.
+
+    def make_env():
+        return RecSysEnv(action_pool, num_available, **options)
+
+    envs = SyncVectorEnv([make_env] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    # Gymnasium would seed environment i with seed + i, so runs with seeds 0 and 1 would share all
+    # environments but one. SeedSequence gives unrelated seeds.
     envs.reset(seed=np.random.SeedSequence(seed).generate_state(num_envs).tolist())
     return envs
 
 
-# ---- floors and ceilings: what could be reached ----
-
-# Each scores the products on offer, (K,), from taste c.v (K,) and popularity mu (K,); the best is
-# recommended. The oracle knows all, but not what comes after. c-only is the ceiling for unseen
-# products when mu is hidden and clicks are not remembered.
-# CTR with 500 of the test products on offer: 0.158, 0.302, 0.633, 0.658 (standard errors 0.002).
+# ---- floors and ceilings: what simple policies reach, to compare a trained one with ----
+# Each policy scores the available products, (K,), from taste c.v (K,) and popularity mu (K,); the
+# best is recommended. random is the floor. c-only knows c and v, not mu: the ceiling for unseen
+# products while mu is hidden, for a policy that remembers no clicks. The oracle knows mu, too, and
+# always recommends the likeliest click; it does not plan ahead. The numbers are the CTR with 500
+# available test products (10,000 episodes, default seed 5; standard errors 0.002).
 POLICIES = {
-    "random": lambda taste, mu, rng: rng.random(len(mu)),
-    "c-only": lambda taste, mu, rng: taste,
-    "mu-only": lambda taste, mu, rng: mu,
-    "oracle": lambda taste, mu, rng: taste + mu,
+    "random": lambda taste, mu, rng: rng.random(len(mu)),  # 0.158
+    "c-only": lambda taste, mu, rng: taste,  # 0.302
+    "mu-only": lambda taste, mu, rng: mu,  # 0.633
+    "oracle": lambda taste, mu, rng: taste + mu,  # 0.658
 }
-COLORS = dict(zip(POLICIES, ("dimgray", "tab:blue", "tab:purple", "tab:green"), strict=True))
+COLORS = {
+    "random": "dimgray",
+    "c-only": "tab:blue",
+    "mu-only": "tab:purple",
+    "oracle": "tab:green",
+}
 
 
-def play(env: RecSysEnv, policy: str, rng: np.random.Generator, seed=None) -> tuple[int, int]:
-    """One more episode by a policy that is told the user: (clicks, recommendations)."""
+def play(env: RecSysEnv, policy: str, rng: np.random.Generator, seed=None) -> float:
+    """Play an episode, recommending what the policy scores highest; returns its CTR."""
     env.reset(seed=seed)
-    c, mu = PRODUCTS[env.available], POPULARITY[env.available]  # (K, 16), (K,)
+    c = PRODUCTS[env.available]  # (K, 16)
+    mu = POPULARITY[env.available]  # (K,)
     while not env.ending:
-        env.step(POLICIES[policy](c @ env.user, mu, rng).argmax())  # (K, 16) @ (16,) -> (K,)
-    return env.clicks, env.recommendations
+        score = POLICIES[policy](c @ env.user, mu, rng)  # (K, 16) @ (16,) -> (K,)
+        env.step(score.argmax())
+    return np.mean(env.clicks)
 
 
-def reference_ctr(policy, pool, num_available, episodes, seed=0) -> tuple[float, float]:
-    """Mean of the episodes' CTR, the published metric, and its standard error."""
-    env, rng = RecSysEnv(pool, num_available), np.random.default_rng([seed, 1])
+def reference_ctr(policy, pool, num_available, episodes, seed=0) -> tuple:
+    """The metric of the paper, the mean of the episodes' CTR, and its standard error."""
+    env = RecSysEnv(pool, num_available)
     env.reset(seed=seed)
-    clicks, lengths = np.array([play(env, policy, rng) for _ in range(episodes)]).T
-    ctr = clicks / lengths  # (episodes,): a short episode counts as much as a long one
-    return float(ctr.mean()), float(ctr.std() / np.sqrt(episodes))
+    rng = np.random.default_rng([seed, 1])
+    # [code]: an unweighted mean, so a short episode counts as much as a long one.
+    ctr = [play(env, policy, rng) for _ in range(episodes)]
+    return np.mean(ctr), np.std(ctr) / np.sqrt(episodes)
 
 
 # ---- words and pictures for people ----
-
-
 def episode_text(env: RecSysEnv) -> str:
     """The episode so far, one line per recommendation."""
-    lines, views = ["a new user"], [0]
-    for user, product, click in env.timeline:
-        if product == PAGE_VIEW:
-            views[-1] += 1
-            continue
-        taste, mu = PRODUCTS[product] @ user, POPULARITY[product]
-        p = f"{click_probability(taste + mu):.2f}"[1:]  # .62
-        numbers = f"taste {taste:+.1f}  popularity {mu:+5.1f}  p {p}"
-        outcome = "CLICK   " if click else "no click"
-        lines.append(f"rec {len(lines):3}: product {product:4}  {numbers}  {outcome}")
-        views.append(0)
-    for i, count in enumerate(views):
-        lines[i] += f"  -> organic ({count} view{'s' * (count > 1)})" if count else ""
-    end = f"{env.ending}: {env.clicks} clicks in {env.recommendations} recommendations"
-    return "\n".join([*lines, end])
+    lines = [f"a new user, page views: {env.page_views[0]}"]
+    for i, user in enumerate(env.users):
+        product = env.available[env.choices[i]]
+        taste = PRODUCTS[product] @ user
+        mu = POPULARITY[product]
+        p = click_probability(taste + mu)
+        views = env.page_views[i + 1]
+        line = (
+            f"{i + 1:3}: product {product:4}, taste {taste:+.1f}, "
+            f"popularity {mu:+5.1f}, click probability {p:.2f}"
+        )
+        if env.clicks[i]:
+            line += ", CLICK"
+        if views:
+            line += f", page views: {views}"
+        lines.append(line)
+    lines.append(f"{env.ending}: {sum(env.clicks)} clicks in {len(env.clicks)} recommendations")
+    return "\n".join(lines)
 
 
-def draw_timeline(available: np.ndarray, timeline: list, ending: str = "") -> np.ndarray:
-    """An episode from left to right (`RecSysEnv.timeline`): uint8 (480, 900, 3)."""
-    # A notebook's choice, inherited, can end the import of matplotlib.
+def draw_episode(env: RecSysEnv, shown: int) -> np.ndarray:
+    """The first `shown` recommendations of an episode, from left to right: uint8 (480, 900, 3)."""
+    # Matplotlib is imported here because training needs no pictures. A backend inherited from a
+    # notebook may not be installed, and would make the import fail.
     os.environ.pop("MPLBACKEND", None)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    users, products, clicked = map(np.array, zip(*timeline, strict=True))  # (T, 16), 2 x (T,)
-    views = products == PAGE_VIEW
-    x = np.flatnonzero(~views)  # (n,) recommendations, the other events are page views
-    users, products, clicked = users[x], products[x], clicked[x]
-    p = click_probability((PRODUCTS[products] * users).sum(1) + POPULARITY[products])  # (n,)
-    taste = users @ PRODUCTS[available].T  # (n, 16) @ (16, K) -> (n, K)
-    p_all = click_probability(taste + POPULARITY[available])  # (n, K)
-    best_taste = p_all[np.arange(len(x)), taste.argmax(1)]  # (n,)
-    figure = Figure(figsize=(9, 4.8), dpi=100)
+    # What every available product would have done at every recommendation.
+    users = np.reshape(env.users[:shown], (shown, DIM))
+    taste = users @ PRODUCTS[env.available].T  # (n, 16) @ (16, K) -> (n, K)
+    p = click_probability(taste + POPULARITY[env.available])  # (n, K)
+    row = np.arange(shown)  # (n,)
+    chosen = p[row, np.array(env.choices[:shown], int)]  # (n,)
+    clicked = np.array(env.clicks[:shown], bool)  # (n,)
+    x = row + 1  # the first recommendation is number 1
+
+    figure = Figure((9, 4.8))  # inches of 100 pixels
     canvas = FigureCanvasAgg(figure)
     figure.subplots_adjust(0.075, 0.105, 0.985, 0.86, hspace=0.08)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
-    for axes in (upper, lower):
-        axes.fill_between(range(len(views)), 2 * views, step="mid", color="wheat", label="organic")
-    upper.plot(x, p_all.max(1), color=COLORS["oracle"], label="best product (oracle)")
-    upper.plot(x, best_taste, color=COLORS["c-only"], label="best taste (c-only)")
-    upper.plot(x, p_all.mean(1), color=COLORS["random"], label="average (random)")
-    upper.plot(x[clicked], p[clicked], "o", color="tab:red", label="click")
-    upper.plot(x[~clicked], p[~clicked], "o", mfc="white", mec="black", ms=4.5, label="no click")
+
+    # Above: the curves of three policies, dots for what was recommended, and bars for organic
+    # sessions, which lie between two recommendations.
+    organic = np.flatnonzero(env.page_views[: shown + 1]) + 0.5
+    upper.bar(organic, 0.8, 0.5, color="wheat", label="organic")
+    upper.plot(x, p.max(1), color=COLORS["oracle"], label="best product (oracle)")
+    upper.plot(x, p[row, taste.argmax(1)], color=COLORS["c-only"], label="best taste (c-only)")
+    upper.plot(x, p.mean(1), color=COLORS["random"], label="average (random)")
+    upper.plot(x[clicked], chosen[clicked], "o", color="tab:red", label="click")
+    upper.plot(x[~clicked], chosen[~clicked], "o", mfc="white", mec="black", ms=4, label="no click")
     upper.set(ylim=(0, 0.78), ylabel="click probability")
     upper.legend(loc=(-0.01, 1), ncols=6, frameon=False, fontsize=8.5)
-    title = f"{len(x)} recommendations, {clicked.sum()} clicks{ending and ', '}{ending}"
+    title = f"{shown} recommendations, {clicked.sum()} clicks"
+    if shown == len(env.clicks):
+        title += f"    {env.ending}"
     upper.set_title(title, loc="left", pad=24, weight="bold")
-    lower.plot(x, clicked.cumsum() / np.arange(1, len(x) + 1), color="tab:red")
-    end = max(60, 20 * -(-len(views) // 20))  # ours: the axis grows in steps of 20 events
-    lower.set(xlim=(-0.5, end), ylim=(0, 1.05), yticks=(0, 0.5, 1), ylabel="CTR so far")
-    lower.set_xlabel("events of this user: page views (shaded) and recommendations (dots)")
+
+    # Below: the CTR. The axis is as long as an episode can be, so it stands still in a GIF.
+    lower.plot(x, clicked.cumsum() / x, color="tab:red")
+    lower.set(xlim=(0, MAX_RECOMMENDATIONS + 1), ylim=(0, 1.05), yticks=(0, 0.5, 1))
+    lower.set(xlabel="recommendation", ylabel="CTR so far")
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+    return np.array(canvas.buffer_rgba())[:, :, :3]
 
 
-def draw_click_curve(path: Path, available: np.ndarray, seed: int) -> None:
-    """Left: Eq. 2 and where the products lie on it. Right: the products for one user."""
+def draw_click_curve(path: Path, available: np.ndarray, seed: int):
+    """A PNG for one user. Left: Eq. 2. Right: the available products. On both, four picks."""
+    os.environ.pop("MPLBACKEND", None)  # see draw_episode
     from matplotlib.figure import Figure
 
+    # A product's x in Eq. 2 is the sum of the user's taste for it and its popularity.
     rng = np.random.default_rng([seed, 2])
-    users = rng.standard_normal((1000, DIM))  # ours: enough for a smooth histogram
-    taste, mu = users @ PRODUCTS[available].T, POPULARITY[available]  # (1000, K), (K,)
-    p, grid = click_probability(taste + mu), np.linspace(-15, 15, 400)
-    figure = Figure(figsize=(13, 5.2), layout="constrained")
+    user = rng.standard_normal(DIM)
+    taste = PRODUCTS[available] @ user  # (K, 16) @ (16,) -> (K,)
+    mu = POPULARITY[available]  # (K,)
+    x = taste + mu
+    p = click_probability(x)
+    curve = np.linspace(-15, 15, 400)
+
+    figure = Figure((13, 5.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
-    left.hist((taste + mu).ravel(), 120, density=True, color="#dcdcdc", label="products on offer")
-    left.plot(grid, click_probability(grid), color="black", linewidth=2)
-    dots = right.scatter(taste[0], mu, c=p[0], vmin=0, vmax=0.73, s=20)
-    figure.colorbar(dots, label="click probability", ax=right)
+    left.hist(x, 40, density=True, color="#dcdcdc", label="products")
+    left.plot(curve, click_probability(curve), color="black")
+    dots = right.scatter(taste, mu, c=p)
+    figure.colorbar(dots, label="click probability")
     for name, color in COLORS.items():
-        picks = [POLICIES[name](row, mu, rng).argmax() for row in taste]  # (1000,)
-        mean = p[np.arange(len(users)), picks].mean()
-        at = np.interp(mean, click_probability(grid), grid)
-        left.plot(at, mean, "o", color=color, ms=10, label=f"{name}: {mean:.2f}")
-        right.plot(taste[0, picks[0]], mu[picks[0]], "o", mfc="none", mec=color, mew=2, ms=13)
-    left.set(xlim=(-15, 15), ylim=(0, 0.8), xlabel="x = c . v + mu", ylabel="click probability")
-    left.set_title("Eq. 2, and what four policies pick on average")
-    right.set(xlim=(-11, 11), ylim=(-11, 11), xlabel="taste c . v", ylabel="popularity mu (hidden)")
-    right.set_title("one user, the same picks: popularity outweighs taste")
-    left.legend(loc="center left", frameon=False)
+        pick = POLICIES[name](taste, mu, rng).argmax()
+        left.plot(x[pick], p[pick], "o", color=color, ms=10, label=f"{name}: {p[pick]:.2f}")
+        right.plot(taste[pick], mu[pick], "o", mfc="none", mec=color, ms=14)
+    left.set(ylim=(0, 0.8), xlabel="x = c . v + mu", ylabel="click probability")
+    left.set(title="Eq. 2, and what four policies pick for one user")
+    left.legend(loc="upper left")
+    right.set(aspect="equal", adjustable="datalim", xlabel="taste c . v", ylabel="popularity mu")
+    right.set(title="the same picks: the hidden popularity outweighs taste")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    figure.savefig(temporary, format="png", dpi=100)
-    temporary.replace(path)
+    figure.savefig(path)
 
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
-    """Write frames (H, W, 3) uint8 as an endless GIF, whole or not at all."""
-    images = [Image.fromarray(frame) for frame in frames]
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    duration = round(1000 / fps)  # ms
-    images[0].save(
-        temporary, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0
+    """Write pictures (h, w, 3) uint8 as a GIF that rests on its last picture.
+
+    The file appears whole or not at all.
+    """
+    data = io.BytesIO()
+    pictures = [Image.fromarray(frame) for frame in frames]
+    durations = [round(1000 / fps)] * len(pictures)  # ms
+    durations[-1] = 2000  # so that the end can be seen
+    pictures[0].save(
+        data, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
     )
-    temporary.replace(path)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    try:
+        Path(path).write_bytes(data.getvalue())
+    except OSError:
+        Path(path).unlink(missing_ok=True)
+        raise
 
 
 # ---- the script ----
-
-
 @dataclass
 class Args:
     policy: Literal["random", "c-only", "mu-only", "oracle"] = "c-only"  # who recommends
-    pool: Literal["train", "valid", "test"] = "test"  # products to draw from
-    num_available: int = NUM_AVAILABLE  # products on offer in the episode (Table 3)
-    seed: int = 5  # of user and products on offer; ours: 5 draws a typical user
-    episodes: int = 200  # episodes per entry of the table of floors and ceilings
+    part: Literal["train", "valid", "test"] = "test"  # part of the split that products come from
+    num_available: int = NUM_AVAILABLE  # products available in the episode shown; not in the table
+    seed: int = 5  # of the users and the available products, 0 or more
+    episodes: int = 200  # episodes per entry of the table of floors and ceilings, 1 or more
     out: Path = Path("runs/demo")  # folder for the pictures
 
 
 def main(args: Args) -> None:
-    """What `python recsys.py` does."""
-    if args.episodes < 1:
-        raise ValueError(f"episodes is {args.episodes}, at least 1")
-    pool = split_actions()[args.pool]
-    env = RecSysEnv(pool, args.num_available, "rgb_array")
-    play(env, args.policy, np.random.default_rng([args.seed, 1]), seed=args.seed)
+    """One episode as text and GIF, the click curve, the table of floors and ceilings."""
+    pool = split_actions()[args.part]
+    try:
+        env = RecSysEnv(pool, args.num_available, "rgb_array")
+        rng = np.random.default_rng([args.seed, 1])
+        if args.episodes < 1:
+            raise ValueError("--episodes must be at least 1")
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+    play(env, args.policy, rng, args.seed)
     print(episode_text(env))
-    # ours: a picture every fifth event, and the last one for 1.5 s: time to see the outcome.
-    parts = [env.timeline[:n] for n in range(5, len(env.timeline), 5)]
-    frames = [draw_timeline(env.available, part) for part in parts]
-    frames += [env.render()] * round(1.5 * env.metadata["render_fps"])
+    shown = [*range(0, len(env.clicks), 4), len(env.clicks)]  # a picture every fourth step
+    frames = [draw_episode(env, n) for n in shown]
     save_gif(args.out / "recsys_episode.gif", frames, env.metadata["render_fps"])
     draw_click_curve(args.out / "recsys_click_curve.png", env.available, args.seed)
-    print(f"wrote {args.out}/recsys_episode.gif and {args.out}/recsys_click_curve.png")
+    print(f"wrote recsys_episode.gif and recsys_click_curve.png to {args.out}")
 
-    print(f"\nCTR of reference policies, {args.pool} products, {args.episodes} episodes each:")
-    print("on offer" + "".join(f"{policy:>17}" for policy in POLICIES))
-    for num_available in (25, 50, 500):  # published full test; published validation; Table 3
-        print(f"{num_available:8}", end="")
+    print()
+    print(f"CTR of reference policies, {args.part} products, {args.episodes} episodes each:")
+    print("available", *(f"{policy:>17}" for policy in POLICIES))
+    # [code] 25: final test of C.5 (full observability); 50: validation. 500: Table 3.
+    for num_available in (25, 50, 500):
+        print(f"{num_available:9}", end="")
         for policy in POLICIES:
-            scores = reference_ctr(policy, pool, num_available, args.episodes, args.seed)
-            print("{:9.3f} +- {:.3f}".format(*scores), end="", flush=True)
+            mean, std_error = reference_ctr(policy, pool, num_available, args.episodes, args.seed)
+            print(f"{mean:9.3f} +- {std_error:.3f}", end="", flush=True)
         print()
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except (ValueError, OSError) as e:
-        raise SystemExit(f"error: {e}") from None
+    main(tyro.cli(Args))

@@ -18,8 +18,13 @@ from scipy.spatial import Delaunay
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-import stacking_env
-from stacking_env import FAMILIES, SHAPES, Bullet, StackingEnv, action_observations, make_vec
+stacking_env = pytest.importorskip("stacking_env")  # skipped, with the reason, without pybullet
+FAMILIES = stacking_env.FAMILIES
+SHAPES = stacking_env.SHAPES
+StackingEnv = stacking_env.StackingEnv
+Bullet = stacking_env.Bullet
+action_observations = stacking_env.action_observations
+make_vec = stacking_env.make_vec
 
 ROOT = Path(__file__).parent.parent
 IDS = {family.name: [i for i, s in enumerate(SHAPES) if s.family is family] for family in FAMILIES}
@@ -40,11 +45,11 @@ def inside(family, points):
     """Which points (n, 3), in the shape's own coordinates at scale 1, are in the solid."""
     x, y, z = points.T
     across, above = np.hypot(x, y), np.maximum(np.abs(z) - 1, 0)
-    if family.kind == "sphere":
+    if family.name == "sphere":
         return np.hypot(across, z) <= 1
-    if family.kind == "cylinder":
+    if family.name == "cylinder":
         return (across <= 1) & (above == 0)
-    if family.kind == "capsule":
+    if family.name == "capsule":
         return np.hypot(across, above) <= 1
     return np.any([Delaunay(part).find_simplex(points) >= 0 for part in family.parts()], axis=0)
 
@@ -75,11 +80,8 @@ def test_810_shapes_in_the_published_families():
 
 @pytest.mark.parametrize("name, low, high, turn", [
     ("middle_triangle", 0.08, 0.40, 180), ("hat", 0.08, 0.40, 180), ("triangle", 0.08, 0.40, 360),
-    ("tall_triangle", 0.08, 0.24, 360), ("horizontal_rectangle", 0.08, 0.40, 180),
-    ("dome", 0.16, 0.48, 180), ("tetrahedron", 0.08, 0.48, 45), ("arch", 0.08, 0.40, 180),
-    ("rectangle", 0.08, 0.24, 90), ("half_rectangle", 0.08, 0.48, 180), ("cube", 0.08, 0.48, 45),
-    ("cone", 0.08, 0.48, 0), ("sphere", 0.08, 0.64, 0), ("capsule", 0.08, 0.32, 0),
-    ("cylinder", 0.08, 0.48, 0),
+    ("tall_triangle", 0.08, 0.24, 360), ("dome", 0.16, 0.48, 180), ("tetrahedron", 0.08, 0.48, 45),
+    ("rectangle", 0.08, 0.24, 90), ("sphere", 0.08, 0.64, 0), ("capsule", 0.08, 0.32, 0),
 ])  # fmt: skip
 def test_scales_and_angles_of_a_family(name, low, high, turn):
     scales = sorted({SHAPES[i].scale for i in IDS[name]})
@@ -87,23 +89,6 @@ def test_scales_and_angles_of_a_family(name, low, high, turn):
     assert scales[0] == pytest.approx(low) and scales[-1] == pytest.approx(high)
     assert len(scales) * len(angles) == len(IDS[name])
     assert np.allclose(angles, math.radians(turn) / len(angles) * np.arange(len(angles)))
-
-
-@pytest.mark.parametrize("name, com, moments", [  # mass 1, scale 1, about the centre of mass
-    ("middle_triangle", (0, -1 / 3), (0.389, 0.500, 0.556)),
-    ("hat", (0, 0.4714), (0.444, 0.444, 0.667)),
-    ("triangle", (-1 / 3, -1 / 3), (0.556 - 0.111, 0.444, 0.556 + 0.111)),
-    ("tall_triangle", (-1 / 3, -2 / 3), None), ("cone", (0, -0.5), (0.295, 0.298, 0.298)),
-    ("dome", (0, -0.0756), (0.316, 0.402, 0.580)), ("tetrahedron", (0, -0.5), (0.35, 0.35, 0.40)),
-    ("rectangle", (0, 0), (2 / 3, 5 / 3, 5 / 3)),
-    ("half_rectangle", (0, 0), (5 / 12, 17 / 12, 5 / 3)),
-    ("cube", (0, 0), (2 / 3, 2 / 3, 2 / 3)), ("sphere", (0, 0), (0.4, 0.4, 0.4)),
-    ("capsule", (0, 0), (0.46, 1.21, 1.21)), ("cylinder", (0, 0), (0.5, 7 / 12, 7 / 12)),
-])  # fmt: skip
-def test_mass_properties_are_the_published_ones(name, com, moments):
-    centre, _, ours = stacking_env.mass_properties(SHAPES[LARGEST[name]].family)
-    assert np.allclose(centre[[0, 2]], com, atol=0.003) and abs(centre[1]) < 1e-9
-    assert moments is None or np.allclose(sorted(ours), moments, atol=0.003)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
@@ -201,15 +186,6 @@ def test_a_picture_shows_exactly_what_collides(name):
     assert seen.mean() > 0.02 and (seen & hits).sum() / (seen | hits).sum() > 0.975
 
 
-def test_a_face_is_as_bright_as_it_is_turned_to_the_light():
-    bullet = Bullet()
-    stacking_env.add_shape(bullet, IDS["cube"][-6], (0, 0, 0), (1, 1, 1))  # turned by 0
-    for eye, cosine in (((0, -3, 0.01), 0.82), ((3, 0, 0.01), 0.82), ((0.01, 0, 3), 0.82)):
-        face = stacking_env.grey(stacking_env.photograph(bullet, (eye, (0, 0, 0))))[42, 42]
-        assert abs(int(face) - 255 * (0.35 + 0.65 * cosine)) <= 2
-    assert np.linalg.norm(stacking_env.LIGHT) == pytest.approx(1, abs=1e-3)
-
-
 def test_the_state_shows_the_right_side_and_the_published_scale(env):
     before = env.reset(seed=2)[0]["state"][3].astype(int)
     after = env.step(act(0, 1.0))[0]["state"][3].astype(int)
@@ -229,7 +205,6 @@ def test_views_repeat_for_any_workers_order_and_number():
     assert one.shape == (4, 6, 84, 84) and one.dtype == np.uint8
     assert np.array_equal(one, action_observations(ids, 6, "image", seed=2, workers=3))
     assert np.array_equal(one[1:2, :4], action_observations([3], 4, "image", seed=2))
-    assert not np.array_equal(one, action_observations(ids, 6, "image", seed=3))
 
 
 def test_viewpoints_lie_on_the_published_circles(monkeypatch):
@@ -242,8 +217,8 @@ def test_viewpoints_lie_on_the_published_circles(monkeypatch):
 
 
 @pytest.mark.parametrize("bad, word", [
-    ({"modality": "video"}, "video"), ({"num_observations": 0}, "0"), ({"workers": 0}, "0"),
-    ({"seed": -1}, "negative"), ({"action_ids": [810]}, "810"), ({"action_ids": [1.5]}, "integers"),
+    ({"modality": "video"}, "video"), ({"num_observations": 0}, "0"), ({"workers": 0}, "processes"),
+    ({"seed": -1}, "negative"), ({"action_ids": [810]}, "809"), ({"action_ids": [1.5]}, "integers"),
 ])  # fmt: skip
 def test_bad_requests_for_observations_are_refused(bad, word):
     with pytest.raises(ValueError, match=word):
@@ -263,7 +238,7 @@ def test_every_shape_comes_to_rest_where_it_was_put(early_stop, every, slide, le
     for shape_id in range(0, 810, every):
         stacking_env.empty_world(env._bullet)
         env._bodies, env.shape_ids = [], []
-        env._add(shape_id, 0.3, 0.0, 0.0, (1, 1, 1))
+        env._drop(shape_id, 0.3, 0.0, 0.0, (1, 1, 1))
         (start,), (upright,) = env.poses()
         env._settle()
         (end,), (rotation,) = env.poses()
@@ -475,25 +450,18 @@ def test_the_example_in_the_docstring_runs_to_the_tenth_step():
 
 
 def test_processes_play_the_same_episodes_as_single_environments():
-    pool, rng = stacking_env.split_actions()["test"], np.random.default_rng(0)
-    envs, singles = make_vec(2, pool, 20, seed=11), [StackingEnv(pool) for _ in range(2)]
-    for env, seed in zip(singles, np.random.SeedSequence(11).generate_state(2), strict=True):
-        env.reset(seed=seed)
-    obs, _ = envs.reset()
-    expected, ended = [env.reset()[0] for env in singles], 0
-    for _ in range(14):
-        assert all(np.array_equal(obs[k], [e[k] for e in expected]) for k in obs)
-        stop, x = (rng.random(2) < 0.15).astype(int), rng.uniform(-1, 1, (2, 1))
-        choice = rng.integers(20, size=2)
-        obs, reward, *_, info = envs.step({"choice": choice, "position": x, "stop": stop})
-        for i, env in enumerate(singles):
-            action = {"choice": choice[i], "position": x[i], "stop": stop[i]}
-            expected[i], single_reward, terminated, truncated, single_info = env.step(action)
-            assert single_reward == reward[i]
-            if terminated or truncated:
-                assert info["final_info"]["height"][i] == single_info["height"]
-                expected[i], ended = env.reset()[0], ended + 1
-    assert ended >= 2
+    envs, single = make_vec(2, seed=11), StackingEnv()
+    single.reset(seed=np.random.SeedSequence(11).generate_state(2)[1])
+    (obs, _), (expected, _) = envs.reset(), single.reset()
+    for step in range(12):  # the first one stops in step 4, the second one plays to the end
+        assert all(np.array_equal(obs[k][1], expected[k]) for k in obs)
+        one, other = act(step, 0.5, stop=int(step == 3)), act(step, 0.1 * step - 0.5)
+        obs, reward, *_, info = envs.step({k: np.array([one[k], other[k]]) for k in one})
+        expected, single_reward, _, ended, single_info = single.step(other)
+        assert single_reward == reward[1] and ended == (step == 9)
+        if ended:
+            assert info["final_info"]["height"][1] == single_info["height"]
+            expected, _ = single.reset()
     envs.close()
 
 
@@ -508,13 +476,28 @@ def test_watching_shows_the_fall_and_changes_nothing(env):
     watched.close()
 
 
+def test_a_tower_of_nine_metres_fits_beside_the_text_and_the_policys_view():
+    env = StackingEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render().astype(int)
+    stacking_env.add_shape(env._bullet, LARGEST["cube"], (-1, 0, 8.5), (0, 0, 0))
+    rows, columns = np.nonzero(np.abs(env.render() - before).sum(axis=2))
+    assert 0 < rows.min() < rows.max() < 60 and 100 < columns.min() < columns.max() < 336 - 84
+    env.close()
+
+
 def test_command_line(tmp_path):
-    command = [sys.executable, "stacking_env.py", "--out", str(tmp_path), "--num-available"]
-    out = subprocess.run([*command, "20"], capture_output=True, text=True, cwd=ROOT)
-    assert out.returncode == 0 and "810 shapes" in out.stdout, out.stderr
+    command = [sys.executable, "stacking_env.py", "--split", "full", "--out", str(tmp_path)]
+    out = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert out.returncode == 0 and "greedy tower" in out.stdout, out.stderr
     names = ["stacking_greedy.gif", "stacking_random.gif", "stacking_shapes.png"]
     assert sorted(f.name for f in tmp_path.iterdir()) == names
     gif, sheet = Image.open(tmp_path / names[0]), Image.open(tmp_path / names[2])
-    assert gif.n_frames > 15 and gif.size == (672, 336) and sheet.size == (12 * 168, 8 * 168)
-    out = subprocess.run([*command, "500"], capture_output=True, text=True, cwd=ROOT)
-    assert out.returncode == 1 and out.stderr.splitlines()[-1].startswith("error: 500 actions")
+    assert gif.n_frames > 15 and gif.size == (336, 336) and sheet.size == (12 * 84, 16 * 84)
+
+
+def test_without_pybullet_one_sentence_says_what_is_missing():
+    code = "import sys; sys.modules['pybullet'] = None; import stacking_env"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    last = out.stderr.splitlines()[-1]
+    assert out.returncode == 1 and "needs pybullet" in last and "conda-forge" in last
