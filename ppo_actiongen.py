@@ -1,35 +1,52 @@
 """PPO with a policy over changing sets of actions: train, validate, test on unseen actions.
 
-The policy never sees action ids. It scores every action on offer by a shared utility of state and
-representation c_i (hvae.py), and takes a softmax over the set A on offer:
+An ordinary policy has one output per action, so it cannot use an action it was not trained with.
+This one reads a *representation* c_i of every action, a vector that hvae.py makes from recordings
+of what the action does. A utility function f_nu gives one number to a pair of state and action, and
+a softmax turns the numbers of the available actions into probabilities:
 
     pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
 
-So new actions are simply another list of vectors. Three things help: a random subset of the
-training actions in every episode, an entropy bonus, and selection on held-out *validation* actions.
+A new action is then just another vector. The policy must not learn the training actions by heart,
+so there are three regularisers, marked *so* below: *subsampling*, every episode has its own random
+subset of the training actions; an *entropy bonus*; and *validation*, the policy that is kept is the
+one that does best with actions held out for this choice.
+
+Baselines: `nearest-neighbor` has an output per training action and executes the available action
+nearest to the one it drew; `continuous` draws a point in the space of representations and executes
+the available action nearest to it; `--representation vae` takes a VAE without hierarchy (B).
+Ablations: `--ent-coef 0`, `--no-subsample`. Appendix C: C.1 `--task`; C.2 `--finetune`, `--adapt`;
+C.3 `--no-subgoal-reward`; C.4 `--aux-conditioned`; C.5 `--fully-observable`; C.6 `--placement`,
+`--split full`; C.7 curve.png of every run. A.3's analyses: `create --split analysis
+--representation hvae-all`, then `evaluate RUN --min-angle-gap 9` and its other options.
 
     python ppo_actiongen.py gridworld --quick         # minutes; or: recsys, create, stacking
     python ppo_actiongen.py gridworld --recipe paper  # the policy of Tables 3 and 4
-    python ppo_actiongen.py gridworld --method nearest-neighbor | --ent-coef 0 | --no-subsample
-    python ppo_actiongen.py gridworld --finetune runs/gridworld-ours-s0     # C.2
-    python ppo_actiongen.py evaluate runs/gridworld-ours-s0 --num-available 20
+    python ppo_actiongen.py gridworld --method nearest-neighbor
+    python ppo_actiongen.py gridworld --finetune runs/gridworld-s0     # C.2
+    python ppo_actiongen.py my_env.py                 # an environment of your own: see README.md
+    python ppo_actiongen.py evaluate runs/gridworld-s0 --num-available 20  # see evaluate --help
 
-Paper map, in the order of this file: Tables 3, 4 -> Args, TABLE_3 (ours: FAST, QUICK); D.3.2 state
-encoder f_omega and critic -> mlp, cnn, Agent.encode; utility f_nu -> utility, Agent.choice_logits;
-auxiliary policy, C.4 -> position_head, Agent.act; baselines -> Agent.act, Agent.slot;
-Algorithm 1 -> rollout, gae, ppo_loss, update, train; Algorithm 2 -> evaluate; A.3 -> restrict_pool.
+In the order of this file: hyper-parameters (Tables 3 and 4; lengths of episodes and states are the
+environments'); torchrun; networks (D.3.2, C.4); the main paper's Algorithm 1, training, and
+Algorithm 2, acting with unseen actions; then what surrounds them: which actions are available,
+checks, the run's folder, the command `evaluate` (A.3), the command line.
 
-Shapes: T rollout steps, N environments, B rows of a batch, K actions on offer, D size of a
-representation, H hidden units, A rows of the table, n of them trained on.
+Letters in shapes: T steps of a rollout, N environments, B rows of a batch, K available actions,
+A all actions, D numbers in a representation, H hidden units. The *code* of a state is f_omega(s). A
+step is one action of one environment. A *score* is the environment's METRIC at the end of an
+episode (success, click-through rate, height), a return the sum of its rewards. Two marks: [code] is
+the authors' released implementation, followed where the appendix is silent and in the few places
+that say so; [here] is a choice of this repository, with its reason.
 """
 
 import atexit
 import csv
-import ctypes
-import io
+import errno
 import json
 import math
 import os
+import re
 import shlex
 import sys
 import time
@@ -43,76 +60,101 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 import torch.distributed as dist
-import torch.distributed.nn  # else Adam does, too late: gloo's threads stay
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from filelock import FileLock, Timeout
+from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch.distributions import Beta, Categorical, Distribution, Normal
+from tqdm import tqdm
 
 import hvae
+from hvae import UserError
 
 Distribution.set_default_validate_args(False)  # the checks cost as much as the draws
-RANK, WORLD_SIZE = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+
 
 # ---- Tables 3 and 4: the hyper-parameters ----
-AUX_ENT_SCALE = 0.1  # Table 3 "continuous entropy scaling", D.3.2
 
 
+# An option of your own touches at most four places: a line in Args; the layer, if it needs one, in
+# Agent.__init__; its use, in Agent.act or ppo_loss; and, if you want to watch it, a number in the
+# dictionary that ppo_loss returns, which becomes a column of metrics.csv. (An option of an
+# environment: a line in Args and its name in OPTIONS.) Switched off, it must not make a layer: a
+# new layer draws random numbers, and every run would change.
 @dataclass
 class Args:
     """Train on training actions, select on validation actions, test on unseen ones."""
 
-    env: Annotated[str, tyro.conf.Positional] = "gridworld"  # or recsys, create, stacking
-    method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # ours or baseline
-    representation: str = "hvae"  # hvae, hvae-all, vae, engineered[-5d, -path], FILE.npz
-    modality: str | None = None  # what the action encoder sees (B)
-    split: str = "default"  # of the actions (A.1 to A.4): default, full, ...
-    split_seed: int = 0  # published: one split for all seeds
-    recipe: Literal["fast", "paper"] = "fast"  # ours, or the policy of Tables 3 and 4
-    quick: bool = False  # the same protocol at a laptop's budget
-    seed: int = 0  # one run, bit for bit, on one kind of CPU
-    task: str | None = None  # CREATE: one of 12 (C.1)
-    subgoal_reward: bool = True  # CREATE: --no-subgoal-reward is C.3
-    fully_observable: bool = False  # Recommender: c_i holds mu_i, too (C.5)
-    placement: str | None = None  # Stacking: none, 1d, 2d (C.6)
-    adapt: bool = False  # C.2: train on the test actions, as one set
-    finetune: str | None = None  # C.2: --adapt, from this run; needs its flags
-    ent_coef: float = 0.05  # Table 3; 0: the ablation without entropy
-    ent_floor: float = 1.0  # ours: it decays to this fraction (paper: 1)
-    num_available: int = 50  # Table 3 "actions per episode", K
-    eval_available: int | None = None  # K of evaluations (None: num_available)
-    total_timesteps: int = 40_000_000  # Table 3; one step = one action
-    minibatch_size: int = 4096  # Table 3 "PPO batch size"
-    num_minibatches: int = 4  # published code; so many are a rollout
-    subsample: bool = True  # --no-subsample: always all training actions
-    fixed_set_size: int | None = None  # then, or with --adapt: only so many
-    learning_rate: float = 1e-3  # Table 4, of Adam
-    lr_decay_steps: int | None = None  # decays in so many steps (None: all)
-    gamma: float = 0.99  # Table 4
-    num_envs: int = 32  # Table 4 "parallel processes"
-    hidden_size: int = 64  # Table 4
-    vf_coef: float = 0.5  # Table 4
-    update_epochs: int = 4  # Table 4
-    clip_coef: float = 0.1  # Table 4
-    clip_vloss: bool = True  # published code: clip the value's steps, too
-    aux_conditioned: bool = False  # C.4: the position sees the chosen action
-    one_hot: bool = False  # ours: integer states enter one-hot
-    bilinear: bool = False  # ours: f_nu = c . M f_omega(s)
-    small_gains: bool = True  # published code: f_nu starts with gains of 0.01
-    ink: bool = False  # ours: small pictures, lines on nothing
-    eval_every: int = 410_000  # steps between evaluations
-    valid_episodes: int = 640  # of each
-    eval_episodes: int = 5000  # of the test (published code)
-    hvae_recipe: str = "laptop"  # of the encoder: laptop, quick, paper
-    runs_dir: str = "runs"  # of runs and representations
-    run_name: str | None = None  # the run's folder (None: see run_path)
-    resume: bool = False  # go on, bit for bit
-    device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if any
+    # --- experiment ---
+    env: Annotated[str, tyro.conf.Positional] = "gridworld"  # or recsys, create, stacking, FILE.py
+    recipe: Literal["fast", "paper"] = "fast"  # of the policy: FAST below, or Tables 3 and 4
+    quick: bool = False  # the same protocol in minutes, with fewer steps
+    method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # or a baseline
+    seed: int = 0  # one seed is one run, bit for bit, on one kind of CPU
+    adapt: bool = False  # train on the test actions, a fixed set of them (C.2)
+    finetune: str | None = None  # --adapt, starting from the policy in this run's folder (C.2)
+
+    # --- environment ---
+    split: str = "default"  # how actions are divided into training, validation and test
+    split_seed: int = 0  # seed of that division [code: one division for all seeds]
+    task: str | None = None  # CREATE: one of its twelve tasks (C.1)
+    subgoal_reward: bool = True  # CREATE: reward for the subgoal (off: C.3)
+    placement: str | None = None  # Stacking: who chooses where a shape falls: none, 1d, 2d (C.6)
+    fully_observable: bool = False  # Recommender: representations hold the popularity, too (C.5)
+
+    # --- action representations ---
+    # hvae-all is an encoder that was trained on all actions (the oracle); vae is B's baseline.
+    representation: str = "hvae"  # hvae, hvae-all, vae, engineered[-5d], or a table FILE.npz
+    modality: str | None = None  # what the encoder sees (B): xy, video, ...; None: the first
+    hvae_recipe: Literal["quick", "fast", "paper"] = "fast"  # how long the encoder is trained
+
+    # --- which actions are available ---
+    num_available: int = 50  # K while training (Table 3 "actions per episode")
+    eval_available: int | None = None  # K in evaluations; None: as while training
+    subsample: bool = True  # a random subset per episode; off: always all training actions
+    fixed_set_size: int | None = None  # --no-subsample or --adapt: only this many actions
+
+    # --- PPO (Table 4 unless it says otherwise) ---
+    # Table 3's "PPO batch size" is the size of a minibatch [code]. So CleanRL's num_steps is
+    # minibatch_size * num_minibatches / num_envs here.
+    total_timesteps: int = 40_000_000  # steps of the whole training (Table 3)
+    num_envs: int = 32  # environments side by side ("parallel processes")
+    minibatch_size: int = 4096  # steps in a minibatch (Table 3, "PPO batch size")
+    num_minibatches: int = 4  # minibatches in a rollout [code]
+    update_epochs: int = 4  # passes over one rollout
+    learning_rate: float = 1e-3  # of Adam, at the start
+    lr_decay_steps: int | None = None  # steps until it has fallen to a tenth; None: the whole run
+    gamma: float = 0.99  # discount factor of later rewards
+    clip_coef: float = 0.1  # clipping range of PPO's probability ratio
+    vf_coef: float = 0.5  # weight of the value loss
+    clip_vloss: bool = True  # clip the value's steps as well [code]
+    ent_coef: float = 0.05  # weight of the entropy bonus (Table 3); 0: w/o entropy
+    ent_floor: float = 1.0  # fraction of ent_coef left when the learning rate has fallen [here]
+
+    # --- networks ---
+    hidden_size: int = 64  # units in every hidden layer (Table 4)
+    published_init: bool = True  # initial weights of utility, position and stop as in [code]
+    aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
+    bilinear: bool = False  # utility c . M s in place of an MLP [here]
+    one_hot: bool = False  # integer states enter one-hot in place of as numbers [here]
+    small_pictures: bool = False  # half-size inverted pictures and three convolutions [here]
+
+    # --- evaluation ---
+    eval_every: int = 410_000  # steps between two evaluations
+    valid_episodes: int = 640  # episodes of one evaluation while training
+    eval_episodes: int = 5000  # episodes of the final test [code]
+
+    # --- run ---
+    runs_dir: str = "runs"  # folder of runs and representations
+    run_name: str | None = None  # name of the run's folder; None: see run_name_of
+    resume: bool = False  # go on from the last checkpoint, bit for bit
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
     def __post_init__(self):
-        self.adapt = self.adapt or self.finetune is not None
+        if self.finetune is not None:
+            self.adapt = True
 
 
 TABLE_3 = {
@@ -121,930 +163,1187 @@ TABLE_3 = {
     "num_available": (50, 500, 50, 20),
     "total_timesteps": (40_000_000, 40_000_000, 60_000_000, 3_000_000),
     "minibatch_size": (4096, 2048, 3072, 1024),
-    # What else is not the same in all of them (A.2, B, C.6, published code).
+    # What else is not the same in all of them (A.2, B, C.6, [code]).
     "representation": ("hvae", "engineered", "hvae", "hvae"),  # A.2: recsys provides them
-    "modality": ("xy", None, "xy", "image"),
     "task": (None, None, "push", None),
     "placement": (None, None, None, "1d"),
-    "lr_decay_steps": (None, None, 100_000_000, 100_000_000),  # longer than the run
-    "fixed_set_size": (None, 2000, None, None),  # for the cost of all 5,000
-    "eval_every": (410_000, 164_000, 615_000, 102_400),  # 25, 20, 50, 25 updates
-    "valid_episodes": (640, 160, 640, 200),  # stacking: 40, too few
+    # [code]: longer than the run, so the rate falls to .46 (create) and .97 (stacking) only.
+    "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
+    "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
+    "eval_every": (410_000, 164_000, 615_000, 102_400),  # 25, 20, 50, 25 rollouts
+    "valid_episodes": (
+        640,
+        160,
+        640,
+        200,
+    ),  # stacking [code]: 40, too few to tell checkpoints apart
 }
-COLUMNS_3 = zip(*TABLE_3.values(), strict=True)
-PRESETS = {column[0]: Args(**dict(zip(TABLE_3, column, strict=True))) for column in COLUMNS_3}
-# Our recipe: every difference from Tables 3 and 4, with its reason.
+PRESETS = {}  # environment -> Args with its column of the table
+for number, environment in enumerate(TABLE_3["env"]):
+    PRESETS[environment] = Args(**{name: row[number] for name, row in TABLE_3.items()})
+
+AUX_ENT_SCALE = 0.1  # Table 3 "continuous entropy scaling"
+GAE_LAMBDA = 0.95  # [code]
+MAX_GRAD_NORM = 0.5  # [code]
+LR_FLOOR = 0.1  # [code]: the learning rate falls to this fraction
+
+# The fast recipe: every difference from Tables 3 and 4, all of them [here], with its reason.
 FAST = {
     "gridworld": dict(
-        one_hot=True,  # ids are names, not quantities
+        one_hot=True,  # a cell's id is a name, not a quantity
         minibatch_size=512,  # eight times as many updates per step
-        num_available=20,  # a smaller set has fewer favourites: more get practice
-        eval_available=50,  # ... the tests stay Table 3's
-        ent_floor=0.1,  # commit in the end: a stray skill ends in lava
-        hidden_size=128,  # much to know about skills
-        small_gains=False,  # 0.01 in all layers starves the gradient at first
+        num_available=20,  # favourites are often absent, so the others are tried
+        eval_available=50,  # tests keep the number of Table 3
+        ent_floor=0.1,  # late in training a random skill mostly ends in the lava
+        hidden_size=128,  # 64 units fit fewer skills
+        published_init=False,  # gradients of 1e-6 waste the first updates
         total_timesteps=10_000_000,
     ),
     "recsys": dict(
         bilinear=True,  # an MLP learns single products by heart
-        hidden_size=256,  # 64 miss more of the taste
-        gamma=0.0,  # later clicks only drown the one that was earned
-        minibatch_size=512,
+        hidden_size=256,  # 64 units fit the user's taste less well
+        gamma=0.0,  # a click depends on this recommendation, hardly on earlier ones
+        minibatch_size=512,  # as in Grid World
         num_available=100,  # a fifth of the cost of a step
-        eval_available=500,
+        eval_available=500,  # tests keep the number of Table 3
         total_timesteps=10_000_000,
     ),
     "create": dict(
-        ink=True,  # white paper drowns what tells pictures apart
+        small_pictures=True,  # thin black lines on white: convolutions see mostly the white
         aux_conditioned=True,  # a ramp and a cannon belong in different places
-        small_gains=False,
-        hidden_size=256,  # which tool, and where: more to know
-        minibatch_size=128,
+        published_init=False,  # as in Grid World
+        lr_decay_steps=None,  # the rate falls over the run, whatever its length
+        hidden_size=256,  # which tool, and where: more to represent
+        minibatch_size=128,  # pictures are the cost, so many small updates ...
         num_minibatches=16,
-        update_epochs=1,  # four move the policy too far
-        learning_rate=5e-4,
-        clip_coef=0.2,  # goals are rare: let each one teach more
-        vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions are the critic's
-        clip_vloss=False,  # ... and clipped steps are too small for it
+        update_epochs=1,  # ... but each picture is used once: four passes move the policy too far
+        learning_rate=5e-4,  # smaller minibatches are noisier
+        clip_coef=0.2,  # goals are rare, so each of them may teach more
+        vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
+        clip_vloss=False,  # steps of clip_coef are too small for values near 10
         total_timesteps=4_000_000,
         eval_every=102_400,
     ),
     "stacking": dict(
-        small_gains=False,
-        minibatch_size=32,  # physics is the bill: learn more from it
-        clip_vloss=False,
+        published_init=False,  # as in Grid World
+        lr_decay_steps=None,  # as in CREATE
+        minibatch_size=32,  # physics is the cost, so learn more from each step
+        clip_vloss=False,  # as in CREATE
         total_timesteps=400_000,
         eval_every=20_500,
     ),
 }
-# --quick: so many steps, 500 test episodes, the encoder's quick recipe.
+# --quick: this many steps, at least four evaluations, 500 test episodes, the encoder's quick
+# recipe.
 QUICK = {"gridworld": 1_500_000, "recsys": 1_000_000, "create": 700_000, "stacking": 60_000}
-CEILINGS = {  # best possible on (seen, unseen) actions, with Table 3's K
-    "gridworld": (1.0, 1.0),  # exact search: all but 1 in 7,000 sets
-    "recsys": (0.657, 0.301),  # greedy play; mu_i can be known if seen
-    "recsys-full": (0.657, 0.659),
-}
 
 
-def default_args(env: str, recipe: str = "fast", quick: bool = False) -> Args:
-    """Table 3, then our differences, then --quick; ValueError for an unknown environment."""
-    hvae.load_environment(env)
-    args = replace(PRESETS.get(env, Args(env)), recipe=recipe, quick=quick)
+def default_args(env="gridworld", recipe="fast", quick=False):
+    """Table 3, then the fast recipe, then --quick; UserError for an unknown environment.
+
+    An environment of your own may hold DEFAULTS, a dictionary of fields of Args.
+    """
+    module = hvae.load_environment(env)
+    if env in PRESETS:
+        args = PRESETS[env]
+    else:  # the absolute path, so that `evaluate` and --resume find the file from everywhere
+        own = getattr(module, "DEFAULTS", {})
+        args = Args(env=str(Path(env).resolve()), **own)
+    args = replace(args, recipe=recipe, quick=quick)
     if recipe == "fast":
-        args = replace(args, lr_decay_steps=None, **FAST.get(env, {}))
+        args = replace(args, **FAST.get(env, {}))
     if quick:
-        steps = QUICK.get(env, 100_000)
-        args = replace(args, total_timesteps=steps, eval_episodes=500, hvae_recipe="quick")
-        args.eval_every = min(args.eval_every, steps // 4)  # checkpoints to choose from
+        args.total_timesteps = QUICK.get(env, args.total_timesteps // 10)
+        args.eval_every = min(args.eval_every, args.total_timesteps // 4)
+        args.eval_episodes = 500
+        args.hvae_recipe = "quick"
     return args
 
 
+# ---- torchrun: several processes that train one policy ----
+
+# Started by `torchrun --nproc_per_node=2 ppo_actiongen.py ...`, each process (its number is RANK)
+# plays its share of the environments and learns from its share of every minibatch. Gradients are
+# averaged, so all processes keep the same weights. Rank 0 alone evaluates, writes and prints.
+# Started by `python`, there is one process, and these two functions do nothing.
+RANK = int(os.environ.get("RANK", 0))
+WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
+
+
+def gather_from_all(x):
+    """The objects `x` of all processes, in the order of their ranks."""
+    gathered = [x] * WORLD_SIZE
+    if WORLD_SIZE > 1:
+        dist.all_gather_object(gathered, x)
+    return gathered
+
+
+def sum_over_all(x):
+    """Replace `x` by the sum over all processes."""
+    if WORLD_SIZE > 1:
+        dist.all_reduce(x)
+
+
 # ---- D.3.2: the networks ----
-def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
-    """Orthogonal weights, zero bias (published code)."""
+
+
+def layer_init(layer, gain=2**0.5):
+    """Orthogonal weights of this gain, bias 0 [code]."""
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer
 
 
-def mlp(inputs: int, H: int) -> nn.Sequential:
-    """f_omega of vectors (D.3.2): "2-layer MLP with tanh activation"."""
-    first, second = layer_init(nn.Linear(inputs, H)), layer_init(nn.Linear(H, H))
+def mlp(inputs, H):
+    """f_omega of vectors, (B, inputs) -> (B, H). D.3.2: "2-layer MLP with tanh activation"."""
+    first = layer_init(nn.Linear(inputs, H))
+    second = layer_init(nn.Linear(H, H))
     return nn.Sequential(first, nn.Tanh(), second, nn.Tanh())
 
 
-def cnn(frames: int, H: int, ink: bool) -> nn.Sequential:
-    """f_omega of pictures (D.3.2): "5-layer convolutional network", linear, ReLU; ink: 3."""
-    # published code: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side. Ink: 42 -> 21 -> 11 -> 6. From
-    # 3 x 3 the code knows less well where the balls are: push, 4M steps, validation .64, not .75.
-    channels, side = ([frames, 16, 32, 64], 6) if ink else ([frames, 16, 16, 32, 32, 32], 3)
-    layers, features = [], channels[-1] * side**2
-    for into, out in pairwise(channels):
-        conv = nn.Conv2d(into, out, 3, stride=2, padding=1)
-        # published code: PyTorch's own weights; they hide what differs between pictures
-        layers += [layer_init(conv) if ink else conv, nn.ReLU()]
-    # (B, C, h, w) -> (B, C h w); ink, few lines on the picture or many: features of one size
-    layers += [nn.Flatten(), *[nn.LayerNorm(features, elementwise_affine=False)] * ink]
+def cnn(frames, H, small):
+    """f_omega: pictures (B, frames, 84, 84) -> (B, H). D.3.2: "5-layer convolutional network".
+
+    small: pictures (B, frames, 42, 42), three layers [here].
+    """
+    # A stride of 2 halves the picture [code]: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side.
+    channels = [frames, 16, 16, 32, 32, 32]
+    features = 32 * 3 * 3
+    if small:
+        # [here] 42 -> 21 -> 11 -> 6. At 6 x 6 the features still show where the balls are.
+        channels = [frames, 16, 32, 64]
+        features = 64 * 6 * 6
+    layers = []
+    for before, after in pairwise(channels):
+        conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
+        if small:  # [code] keeps PyTorch's weights: all pictures give nearly the same output
+            layer_init(conv)
+        layers += [conv, nn.ReLU()]
+    layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
+    if small:  # so that it does not matter how many lines are drawn, only where
+        layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
 
-def position_head(H: int, d: int, args: Args) -> nn.Module:
-    """D.3.2: linear, of the code (B, H). C.4: two layers, of [code; action] (B, 2H)."""
-    if not args.aux_conditioned:
-        return layer_init(nn.Linear(H, d), 1.0)
-    # published code: gain 1, at first a random place per tool; ours: one place
-    out = layer_init(nn.Linear(H, d), 1.0 if args.small_gains else 0.01)
-    return nn.Sequential(layer_init(nn.Linear(2 * H, H), 1.0), nn.ReLU(), out)
-
-
-def as_ink(frames: torch.Tensor) -> torch.Tensor:
+def small_inverted(frames):
     """Pictures (N, C, 84, 84) uint8, black on white -> (N, C, 42, 42) uint8, 255 on 0."""
-    rows = frames[:, :, ::2].float() + frames[:, :, 1::2]  # (N, C, 42, 84)
-    ink = 255 - (rows[..., ::2] + rows[..., 1::2]) / 4  # (N, C, 42, 42)
-    return (ink * frames.flatten(2).any(2)[..., None, None]).byte()  # black: no frame
+    # The white background becomes 0. At the start of an episode, the stack of frames is padded with
+    # black ones; inverted they would be all 255, so they are set to 0.
+    is_real = frames.amax((2, 3), keepdim=True) > 0  # (N, C, 1, 1)
+    halved = F.avg_pool2d(frames.float(), 2)  # (N, C, 42, 42)
+    return ((255 - halved) * is_real).byte()
 
 
 class RunningMeanStd(nn.Module):
-    """Mean and std of a stream of numbers: count, sum, sum of squares in float64."""
+    """Mean and standard deviation of all numbers seen so far, one each per element of `shape`."""
 
-    def __init__(self, shape: tuple[int, ...] = ()):
+    def __init__(self, shape=()):
         super().__init__()
+        # Count, sum and sum of squares, as if 1e-4 numbers of variance 1 had been seen [code].
         prior = [torch.full(shape, x, dtype=torch.float64) for x in (1e-4, 0.0, 1e-4)]
-        self.register_buffer("sums", torch.stack(prior))  # published code
+        self.register_buffer("sums", torch.stack(prior))  # (3, *shape)
 
-    def update(self, x: torch.Tensor) -> None:
-        """Add a batch (n, *shape), those of all processes together."""
-        x = torch.cat(everyone(x)).double()
-        self.sums += torch.stack([torch.ones_like(x), x, x.square()]).sum(1)
+    def update(self, x):
+        """Add a batch (n, *shape), and those of the other processes."""
+        x = x.double()
+        new = torch.stack([torch.ones_like(x), x, x.square()]).sum(1)  # (3, n, ...) -> (3, ...)
+        sum_over_all(new)
+        self.sums += new
 
-    def mean_std(self) -> tuple[torch.Tensor, torch.Tensor]:
-        mean, square = self.sums[1:] / self.sums[0]
-        return mean.float(), (square - mean.square() + 1e-8).sqrt().float()
-
-
-def utility(u, P, w, available):
-    """logits[b, k] = w . relu(u[b] + P[available[b, k]]), for all k on offer.
-
-    The hidden layer of f_nu sees the concatenation [code s; projected action A c + a]. It splits:
-    W [s; A c + a] + b = W_s s + (W_c (A c + a) + b) = u + P, with u once per state, and P once per
-    action of the whole table.
-    """
-    x = u[:, None] + P[available]  # (B, 1, H) + (B, K, H)
-    return F.relu(x) @ w  # (B, K, H) @ (H,) -> (B, K)
-
-
-class Utility(torch.autograd.Function):
-    """The same on a CPU: in pieces that stay in its cache, the hidden layer never stored.
-
-    With g the gradient of a logit and G_u, G_P the sums of g over the open units of a state, of an
-    action: dL/du = G_u w, dL/dP = G_P w, and dL/dw = sum_b u G_u + sum_a P G_P.
-    """
-
-    @staticmethod
-    def hidden(u, P, sets):  # (b, H), (A, H), (b, K) -> (b, K, H)
-        return P.index_select(0, sets.reshape(-1)).view(*sets.shape, -1).add_(u[:, None])
-
-    @staticmethod
-    def forward(ctx, u, P, w, available):
-        ctx.save_for_backward(u, P, w, available)
-        rows = max(1, 800_000 // (available.shape[1] * u.shape[1]))  # 3 MB of float32
-        ctx.pieces = [slice(i, i + rows) for i in range(0, len(u), rows)]
-        return torch.cat([Utility.hidden(u[r], P, available[r]).relu_() @ w for r in ctx.pieces])
-
-    @staticmethod
-    def backward(ctx, grad):
-        u, P, w, available = ctx.saved_tensors
-        G_u, G_P = torch.empty_like(u), torch.zeros_like(P)
-        for r in ctx.pieces:
-            g, sets = grad[r], available[r]  # (b, K) both
-            x = Utility.hidden(u[r], P, sets).gt_(0)  # 1 where the ReLU is open, else 0
-            G_u[r] = torch.bmm(g[:, None], x)[:, 0]  # (b, 1, K) @ (b, K, H) -> (b, H)
-            G_P.index_add_(0, sets.reshape(-1), x.mul_(g[..., None]).flatten(0, 1))
-        return G_u * w, G_P * w, (u * G_u).sum(0) + (P * G_P).sum(0), None
+    def mean_std(self):
+        count, total, squares = self.sums
+        mean = total / count
+        variance = squares / count - mean.square() + 1e-8
+        return mean.float(), variance.sqrt().float()
 
 
 class Agent(nn.Module):
-    """The policy and the critic of D.3.2, or a baseline's policy.
+    """The policy and the critic of D.3.2, or the policy of a baseline.
 
-    `table` (A, D): a representation per action, fixed. `train_ids` (n,): those of training, sorted.
+    table (A, D): the representation of every action; it is never trained here. train_ids (n,): the
+    sorted ids of the actions that can be available while training.
     """
 
-    def __init__(self, envs: VectorEnv, table, train_ids, args: Args):
+    def __init__(self, envs, table, train_ids, args):
         super().__init__()
-        shape, self.args = envs.single_observation_space["state"].shape, args
-        H, D, self.is_image = args.hidden_size, table.shape[1], len(shape) == 3
+        self.args = args
+        H = args.hidden_size
+        D = table.shape[1]
         self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
-        self.register_buffer("train_ids", torch.tensor(train_ids))  # (n,)
-        # State encoder and critic share the convolutions; without pictures, nothing.
+        self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
+
+        # f_omega and the critic V. With pictures they share the convolutions, else nothing [code].
+        state = envs.single_observation_space["state"]
+        self.is_image = len(state.shape) == 3
         if self.is_image:
-            self.encoder, self.critic = cnn(shape[0], H, args.ink), layer_init(nn.Linear(H, 1))
+            self.encoder = cnn(state.shape[0], H, args.small_pictures)
+            self.critic = layer_init(nn.Linear(H, 1))
         else:
-            self.obs_stats, width = RunningMeanStd(shape), math.prod(shape)
-            if args.one_hot:  # Grid World shows all of its ids in every first state
-                ids = torch.unique(torch.as_tensor(envs.reset()[0]["state"]))
-                self.register_buffer("cell_ids", ids)
-                width *= len(ids)
+            self.obs_stats = RunningMeanStd(state.shape)
+            width = math.prod(state.shape)
+            if args.one_hot:  # Grid World's first states hold all ids that there are
+                first_states = envs.reset()[0]["state"]
+                self.register_buffer("cell_ids", torch.as_tensor(first_states).unique())
+                width *= len(self.cell_ids)
             self.encoder = mlp(width, H)
             self.critic = nn.Sequential(mlp(width, H), layer_init(nn.Linear(H, 1)))
-        # Utility. Gains of 0.01 (published code) make a uniform policy, and gradients of 1e-6.
-        project, hidden, out = (0.01,) * 3 if args.small_gains else (1.0, math.sqrt(2), 0.01)
-        if args.method == "utility" and not args.bilinear or args.aux_conditioned:
-            self.action_project = layer_init(nn.Linear(D, H), project)
-        if args.method == "nearest-neighbor":  # a logit per training action
-            self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01)
-        elif args.method == "continuous":  # a Gaussian over representations
-            self.head_mean, self.head_var = (layer_init(nn.Linear(H, D), 1.0) for _ in "mv")
-        elif args.bilinear:
+
+        # CREATE and Shape Stacking have Dict actions: "choice", "position" and, in Stacking,
+        # "stop". Elsewhere an action is the choice alone, and action_parts is empty.
+        self.action_parts = getattr(envs.single_action_space, "spaces", {})
+
+        # What chooses among the available actions. [code] starts all three layers of the utility
+        # with a gain of 0.01. Gradients shrink on their way through them to about 1e-6, and
+        # learning starts late. [here, fast recipe] only the last layer is small.
+        project_gain, hidden_gain = (0.01, 0.01) if args.published_init else (1.0, 2**0.5)
+        has_mlp = args.method == "utility" and not args.bilinear
+        is_conditioned = args.aux_conditioned and "position" in self.action_parts
+        if has_mlp or is_conditioned:
+            self.action_project = layer_init(nn.Linear(D, H), project_gain)
+        if has_mlp:
+            self.utility_hidden = layer_init(nn.Linear(2 * H, H), hidden_gain)
+            self.utility_out = layer_init(nn.Linear(H, 1), 0.01)
+        elif args.method == "utility":
             self.utility_query = layer_init(nn.Linear(H, D), 0.01)
-        else:
-            self.utility_hidden = layer_init(nn.Linear(2 * H, H), hidden)
-            self.utility_out = layer_init(nn.Linear(H, 1), out)
-        heads = getattr(envs.single_action_space, "spaces", {})
-        self.has_position, self.has_stop = "position" in heads, "stop" in heads
-        if self.has_position:
-            d = heads["position"].shape[0]
-            self.fc_alpha, self.fc_beta = (position_head(H, d, args) for _ in "ab")
-        if self.has_stop:
+        elif args.method == "nearest-neighbor":  # a logit for each training action
+            self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01)
+        else:  # a Gaussian over representations
+            self.head_mean = layer_init(nn.Linear(H, D), 1.0)
+            self.head_var = layer_init(nn.Linear(H, D), 1.0)
+
+        # The auxiliary policy f_chi: where to place the action, whether to stop (D.3.2, A.4).
+        if "position" in self.action_parts:
+            self.fc_alpha = self.position_head()
+            self.fc_beta = self.position_head()
+        if "stop" in self.action_parts:
             self.fc_stop = layer_init(nn.Linear(H, 2), 0.01)
-            if not args.small_gains:  # ours: else a new policy stops after two shapes
+            # Outputs: 0 go on, 1 stop. Untrained, they are equally likely, and a tower ends after
+            # two shapes. The fast recipe starts with going on [here].
+            if not args.published_init:
                 nn.init.constant_(self.fc_stop.bias[0], 4.0)
 
-    def see(self, obs: dict[str, np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
-        """An observation as tensors: state (N, ...) and ids on offer (N, K)."""
-        state, available = (torch.as_tensor(obs[k]) for k in ("state", "available"))
-        state = as_ink(state) if self.args.ink else state
+    def position_head(self):
+        """The layers behind alpha, or beta, of the Beta distribution over positions."""
+        H = self.args.hidden_size
+        dims = self.action_parts["position"].shape[0]
+        if not self.args.aux_conditioned:  # D.3.2: linear, from the code of the state
+            return layer_init(nn.Linear(H, dims), 1.0)
+        # C.4: two layers, from the code and the projected action (B, 2H). With [code]'s gain of 1
+        # each action has a favourite place of its own before training. [here] all start alike.
+        hidden = layer_init(nn.Linear(2 * H, H), 1.0)
+        last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
+        return nn.Sequential(hidden, nn.ReLU(), last)
+
+    def to_tensors(self, obs):
+        """An observation as tensors: states (N, ...) and ids of the available actions (N, K)."""
+        state = torch.as_tensor(obs["state"])
+        if self.args.small_pictures:
+            state = small_inverted(state)
+        available = torch.as_tensor(obs["available"])
         return state.to(self.table.device), available.to(self.table.device)
 
-    def encode(self, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """State (B, ...) -> its code f_omega(s) (B, H) and its value V(s) (B,)."""
-        if self.is_image:
+    def encode(self, state):
+        """States (B, ...) -> their codes f_omega(s) (B, H) and values V(s) (B,)."""
+        if self.is_image:  # grey levels 0..255 -> 0..1
             code = self.encoder(state.float() / 255)
-            return code, self.critic(code)[:, 0]
+            return code, self.critic(code).squeeze(1)
+        # Numbers are brought to mean 0 and standard deviation 1 [code]. If they are ids of cells, a
+        # number says less than a vector with a single 1 at the place of the id.
         if self.args.one_hot:
-            names = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
-            x = F.one_hot(names, len(self.cell_ids)).flatten(1).float()  # (B, cells * ids)
+            number = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
+            x = F.one_hot(number, len(self.cell_ids)).flatten(1).float()  # (B, cells * ids)
         else:
             mean, std = self.obs_stats.mean_std()
-            x = ((state - mean) / std).clamp(-10, 10)  # published code
-        return self.encoder(x), self.critic(x)[:, 0]
+            x = ((state - mean) / std).clamp(-10, 10).flatten(1)  # [code]; (B, numbers)
+        return self.encoder(x), self.critic(x).squeeze(1)
 
-    def project_actions(self, ids: torch.Tensor | None = None) -> torch.Tensor:
-        """P, the action's part of `utility`: for all (A, H), or for `ids` (n, H)."""
-        table = self.table if ids is None else self.table[ids]
-        if self.args.method != "utility" or self.args.bilinear:
-            return table
-        W_c = self.utility_hidden.weight[:, self.args.hidden_size :]  # (H, H)
-        return self.action_project(table) @ W_c.T + self.utility_hidden.bias
+    def utility(self, code, available):
+        """f_nu (D.3.2): codes (B, H) and ids of available actions (B, K) -> logits (B, K)."""
+        if self.args.bilinear:  # [here] c . M s, where the layer utility_query is M
+            query = self.utility_query(code)  # (B, D)
+            return torch.einsum("bd,bkd->bk", query, self.table[available])
 
-    def choice_logits(self, code, available, P):
-        """Code (B, H), rows of P on offer (B, K) -> logits (B, K); nearest neighbour: (B, n)."""
-        if self.args.method == "nearest-neighbor":
-            return self.head(code)
-        if self.args.bilinear:  # (B, 1, D) @ (B, D, K) -> (B, 1, K)
-            return torch.bmm(self.utility_query(code)[:, None], P[available].mT)[:, 0]
-        u = code @ self.utility_hidden.weight[:, : self.args.hidden_size].T  # (B, H): W_s s
-        score = utility if u.is_cuda else Utility.apply
-        return score(u, P, self.utility_out.weight[0], available) + self.utility_out.bias
+        # How good is it to take the action with representation c in a state with code s? D.3.2 asks
+        #
+        #     hidden = ReLU(W [s; project(c)] + b),    logit = out(hidden).
+        #
+        # [s; project(c)] is the concatenation. Half of W's columns, W_s, meet s, the other half,
+        # W_c, meet project(c) = P c + p. So what is inside of the ReLU is a sum,
+        #
+        #     W [s; P c + p] + b  =  (W_s s + b)  +  (W_c P c + W_c p),
+        #
+        # of a part that is the same for all actions and a part that is the same for all states.
+        # Each is computed once; only their sum is formed for every pair. The logits are the same,
+        # at a fraction of the cost. (exercises/README.md, 2: write the concatenation.)
+        W_s, W_c = self.utility_hidden.weight.chunk(2, dim=1)  # (H, H) each
+        project = self.action_project
+        state_part = F.linear(code, W_s, self.utility_hidden.bias)  # (B, H)
 
-    def slot(self, output, available):
-        """Output of the policy -> slot (B,) of the set on offer."""
-        # Baselines: the action nearest to the training action or to the point (B, D) that is put
-        # out. This is part of the environment: no gradient goes through it.
+        # The action's part is needed for those U actions only that are available somewhere in this
+        # batch. `row_of_id` says where among them the action of an id stands.
+        occurs = torch.zeros(len(self.table), dtype=torch.bool, device=code.device)
+        occurs[available] = True
+        row_of_id = occurs.cumsum(0) - 1  # (A,)
+        weight = W_c @ project.weight  # (H, D): two linear maps in a row are one
+        bias = W_c @ project.bias  # (H,)
+        action_part = F.linear(self.table[occurs], weight, bias)  # (U, H)
+
+        # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
+        # into the processor's cache, so they are made in pieces of 800,000 numbers (3 MB) [here].
+        piece = max(1, 800_000 // (available.shape[1] * code.shape[1]))
+        logits = []
+        for states, rows in zip(
+            state_part.split(piece), row_of_id[available].split(piece), strict=True
+        ):
+            actions = action_part.index_select(0, rows.flatten())  # (b * K, H)
+            hidden = states[:, None] + actions.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
+            logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
+        return torch.cat(logits) + self.utility_out.bias
+
+    def choice_policy(self, code, available):
+        """What is drawn from: K logits or, in a baseline, n logits or a Gaussian."""
+        if self.args.method == "nearest-neighbor":  # one of the n training actions
+            return Categorical(logits=self.head(code))  # (B, n)
+        if self.args.method == "continuous":  # a point in the space of representations [code]
+            std = F.softplus(self.head_var(code)).sqrt()
+            return Normal(self.head_mean(code), std)  # (B, D)
+        return Categorical(logits=self.utility(code, available))  # (B, K)
+
+    def index_of(self, drawn, available):
+        """Which of the available actions is meant by what was drawn, (B,) in 0..K-1."""
         if self.args.method == "utility":
-            return output
+            return drawn
+        # A baseline takes the available action nearest to the training action, or to the point,
+        # that was drawn. This belongs to the environment: no gradient passes. (While
+        # nearest-neighbor is trained, all training actions are available, so it gets what it drew.)
         if self.args.method == "nearest-neighbor":
-            output = self.table[self.train_ids[output]]  # (B,) -> (B, D)
-        return (self.table[available] - output[:, None]).square().sum(2).argmin(1)  # of (B, K, D)
+            drawn = self.table[self.train_ids[drawn]]  # (B,) -> (B, D)
+        difference = self.table[available] - drawn[:, None]  # (B, K, D) - (B, 1, D)
+        return difference.square().sum(2).argmin(1)
 
-    def act(self, state, available, P, action=None, greedy=False):
-        """Choose, or score what was chosen: CleanRL's `get_action_and_value`.
+    def act(self, state, available, action=None):
+        """Draw an action, or judge one that was drawn: CleanRL's `get_action_and_value`.
 
-        state (B, ...), rows of P on offer (B, K) -> action, log-probability, entropy, value, each
-        (B,). action: "output" (of the policy), "choice" (the slot that is executed),
-        "taken" (its id), "position", "stop".
+        Returns action, log-probability, entropy and value, (B,) each. An action is a dictionary of
+        "drawn" (what came out of the distribution), "choice" (which of the K available actions that
+        means), "action_id" (its id), and "position" and "stop" where the environment has them.
         """
+        # The policy is a product of up to three distributions: which action, where, and whether to
+        # stop. So their log-probabilities add up, and so do their entropies.
+        is_new = action is None
+        if is_new:
+            action = {}
+        code, value = self.encode(state)
 
-        def draw(policy):  # greedy: the likeliest choice, the mean position (published code)
-            best = policy.mode if isinstance(policy, Categorical) else policy.mean
-            return best if greedy else policy.sample()
-
-        (code, value), new = self.encode(state), action is None
-        action = {} if new else action
-        if self.args.method == "continuous":  # published code
-            policy = Normal(self.head_mean(code), F.softplus(self.head_var(code)).sqrt())
-        else:
-            policy = Categorical(logits=self.choice_logits(code, available, P))
-        if new:
-            action["output"] = draw(policy)
-            action["choice"] = self.slot(action["output"], available)
-            action["taken"] = available.gather(1, action["choice"][:, None])[:, 0]
-        logprob, entropy = policy.log_prob(action["output"]), policy.entropy()
+        # Which action.
+        policy = self.choice_policy(code, available)
+        if is_new:
+            action["drawn"] = policy.sample()
+            action["choice"] = self.index_of(action["drawn"], available)
+            action["action_id"] = available.gather(1, action["choice"][:, None]).squeeze(1)
+        logprob = policy.log_prob(action["drawn"])
+        entropy = policy.entropy()
         if self.args.method == "continuous":
-            # published code: the sum of entropies in Grid World, else the mean; we: the mean, so
-            # that its coefficient does not depend on D. The clamp is the published code's.
-            logprob, entropy = logprob.sum(1).clamp(-1e5, 1e5), entropy.mean(1)
-        if self.has_position:
+            # D numbers were drawn. [code] adds up their entropies in Grid World and averages them
+            # elsewhere; [here] the mean, so that ent_coef means the same for every D.
+            logprob = logprob.sum(1).clamp(-1e5, 1e5)  # [code]: keeps ratios finite
+            entropy = entropy.mean(1)
+
+        # Where to place it: a Beta distribution for each dimension (D.3.2). With parameters above 1
+        # it has one peak, and never one at each border.
+        if "position" in self.action_parts:
             x = code
-            if self.args.aux_conditioned:  # C.4: (B, 2H)
-                x = torch.cat([code, self.action_project(self.table[action["taken"]])], dim=1)
-            # At least 1: a single peak, never one at each border (D.3.2).
+            if self.args.aux_conditioned:  # C.4
+                chosen = self.action_project(self.table[action["action_id"]])  # (B, H)
+                x = torch.cat([code, chosen], dim=1)  # (B, 2H)
             place = Beta(1 + F.softplus(self.fc_alpha(x)), 1 + F.softplus(self.fc_beta(x)))
-            if new:
-                action["position"] = 2 * draw(place) - 1  # (B, d) in [-1, 1]
-            # float32 can round to the border, where the density may be infinite. Half of it per
-            # dimension is the density on [-1, 1]: PPO's ratio does not see a constant.
+            if is_new:
+                action["position"] = 2 * place.sample() - 1  # (B, dims), from [0, 1] to [-1, 1]
+            # float32 may round to the border, where the log-density is minus infinity.
             unit = (0.5 + action["position"] / 2).clamp(1e-6, 1 - 1e-6)
             logprob = logprob + place.log_prob(unit).sum(1)
             entropy = entropy + AUX_ENT_SCALE * place.entropy().sum(1)
-        if self.has_stop:  # A.4: "a binary episode termination action"
+
+        # Whether to stop here (A.4: "a binary episode termination action").
+        if "stop" in self.action_parts:
             stop = Categorical(logits=self.fc_stop(code))
-            if new:
-                action["stop"] = draw(stop)
-            logprob, entropy = logprob + stop.log_prob(action["stop"]), entropy + stop.entropy()
+            if is_new:
+                action["stop"] = stop.sample()
+            logprob = logprob + stop.log_prob(action["stop"])
+            entropy = entropy + stop.entropy()
         return action, logprob, entropy, value
 
 
-# ---- Algorithm 1: rollout, advantages, update ----
+# ---- Algorithm 1: training ----
+
+# 1. Train the encoder on training actions, then compute c_i for all actions (hvae.py).
+# 2. Repeat: at every reset draw K training actions; play; update by PPO with an entropy bonus;
+#    now and then score on validation actions, and keep the best policy.
+# Algorithm 2 is `evaluate`: the kept policy with K unseen actions per episode, nothing is learned.
+
+
 @torch.no_grad()
-def step(envs, obs, agent: Agent, P, greedy: bool = False):
-    """One step: the transition, done (N,), finished episodes (N, 3), the next obs."""
-    state, available = agent.see(obs)
-    action, logprob, _, value = agent.act(state, available, P, greedy=greedy)
-    parts = {k: action[k].cpu().numpy() for k in ("choice", "position", "stop") if k in action}
-    executed = parts if len(parts) > 1 else parts["choice"]  # slots (N,) alone
+def play_step(envs, obs, agent):
+    """One action in each of N environments: the transition, the next observation, the infos."""
+    # The environment wants the number of an available action, 0..K-1, and the other parts.
+    state, available = agent.to_tensors(obs)
+    action, logprob, _, value = agent.act(state, available)
+    executed = action["choice"].cpu().numpy()  # (N,)
+    if agent.action_parts:
+        executed = {name: action[name].cpu().numpy() for name in agent.action_parts}
     obs, reward, terminated, truncated, infos = envs.step(executed)
-    # Time limits count as ends: short, and part of these tasks (published code).
-    done, episodes = terminated | truncated, None
-    taken = dict(state=state, available=available, logprob=logprob, value=value) | action
-    taken |= {k: torch.as_tensor(x).to(value) for k, x in (("reward", reward), ("done", done))}
-    if "episode" in infos:  # where somebody is done: score, return, length
-        score = infos["final_info"][hvae.load_environment(agent.args.env).METRIC]
-        episodes = np.stack([score, infos["episode"]["r"], infos["episode"]["l"]], axis=1)
-    return taken, done, episodes, obs
+
+    # What was available is kept with the transition: the update needs the probability of the action
+    # among just these. Running out of time is an end like any other [code], since the limits are
+    # short and part of the task.
+    transition = dict(state=state, available=available, logprob=logprob, value=value, **action)
+    transition["reward"] = torch.as_tensor(reward).to(value)
+    transition["done"] = torch.as_tensor(terminated | truncated).to(value)  # 1.0 or 0.0
+    return transition, obs, infos
 
 
-def rollout(envs, obs, agent: Agent, num_steps: int):
-    """Collect T steps: a batch of (T, N, ...) tensors, the next obs, finished episodes."""
-    # It holds ids (T, N, K): the update takes the softmax over what was on offer.
-    P, steps, finished = agent.project_actions(), [], []
+def ended_episodes(infos, args):
+    """(number of the environment, score, return, length) of every episode that ended just now."""
+    # An environment whose episode ends is reset within the same step. What it said at the end is in
+    # "final_info"; return and length are added by gymnasium's RecordEpisodeStatistics.
+    if "episode" not in infos:
+        return []
+    metric = hvae.load_environment(args.env).METRIC
+    if metric not in infos.get("final_info", {}):
+        raise UserError(f"the last info of an episode does not hold the metric {metric!r}")
+    scores = infos["final_info"][metric]
+    episode = infos["episode"]
+    ended = np.flatnonzero(infos["_episode"])
+    return [(n, scores[n], episode["r"][n], episode["l"][n]) for n in ended]
+
+
+def episode_means(episodes):
+    """Mean score, return and length of `ended_episodes`; None for each if there are none."""
+    if not episodes:
+        return None, None, None
+    return np.mean(episodes, axis=0)[1:].tolist()
+
+
+def rollout(envs, obs, agent, num_steps):
+    """Play T steps: a batch of (T, N, ...) tensors, the next observation, the ended episodes."""
+    transitions = []
+    episodes = []
     for _ in range(num_steps):
-        taken, done, episodes, obs = step(envs, obs, agent, P)
-        steps.append(taken)
-        finished += [*episodes[done]] if done.any() else []
-    return {k: torch.stack([s[k] for s in steps]) for k in steps[0]}, obs, finished
+        transition, obs, infos = play_step(envs, obs, agent)
+        transitions.append(transition)
+        episodes += ended_episodes(infos, agent.args)
+    batch = {name: torch.stack([t[name] for t in transitions]) for name in transitions[0]}
+    return batch, obs, episodes
 
 
-def gae(rewards, values, dones, next_value, gamma: float, lam: float = 0.95):
-    """Generalised advantage estimation; all (T, N), next_value (N,).
+def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
+    """Generalised advantage estimation: how much better each step turned out than expected.
 
-    delta_t = r_t + gamma (1 - done_t) V_{t+1} - V_t
-    A_t = delta_t + gamma lam (1 - done_t) A_{t+1}
-    """  # done_t says that *this* step ended the episode (CleanRL's is shifted by one)
-    advantages, last = torch.empty_like(rewards), 0.0
+    All are (T, N), next_value is (N,). With the surprise delta_t of one step,
+
+        delta_t = r_t + gamma (1 - done_t) V_{t+1} - V_t
+        A_t     = delta_t + gamma lam (1 - done_t) A_{t+1}
+
+    done_t says that *this* step ended the episode (CleanRL's is shifted by one step).
+    """
+    # Backwards, since each advantage contains the next one. After the last step of the rollout the
+    # critic says what is still to come.
+    advantages = torch.empty_like(rewards)
+    next_advantage = 0.0
     for t in reversed(range(len(rewards))):
         alive = 1.0 - dones[t]
         delta = rewards[t] + gamma * alive * next_value - values[t]
-        advantages[t] = last = delta + gamma * lam * alive * last
+        next_advantage = delta + gamma * lam * alive * next_advantage
+        advantages[t] = next_advantage
         next_value = values[t]
     return advantages
 
 
-def discounted_returns(rewards, dones, G, gamma: float):
-    """G <- gamma G + r over a rollout: all of them (T, N) and the last one (N,)."""
+def discounted_returns(rewards, dones, G, gamma):
+    """G <- gamma G + r, step by step: all of them (T, N), and the G to go on with (N,)."""
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
-        returns[t] = G = gamma * G + rewards[t]
-        G = G * (1 - dones[t])
+        G = gamma * G + rewards[t]
+        returns[t] = G
+        G = G * (1.0 - dones[t])
     return returns, G
 
 
-def ppo_loss(agent: Agent, mb: dict, P, ent_coef: float, args: Args):
-    """The clipped loss of one minibatch, and its parts for the record."""
-    _, logprob, entropy, value = agent.act(mb["state"], mb["available"], P, action=mb)
+def ppo_loss(agent, mb, ent_coef):
+    """PPO's clipped loss of one minibatch, and the numbers of it that go into metrics.csv."""
+    # How much likelier is each action now than when it was played?
+    args = agent.args
+    action = {name: mb[name] for name in ("drawn", "action_id", *agent.action_parts)}
+    _, logprob, entropy, value = agent.act(mb["state"], mb["available"], action)
     logratio = logprob - mb["logprob"]
     ratio = logratio.exp()
-    clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
-    pg_loss = -torch.min(ratio * mb["advantage"], clipped * mb["advantage"]).mean()
-    v_error = (value - mb["return"]).square()
-    if args.clip_vloss:  # published code: on the value's own scale
-        near = mb["value"] + (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
-        v_error = torch.max(v_error, (near - mb["return"]).square())
-    v_loss, entropy = 0.5 * v_error.mean(), entropy.mean()
+
+    # Actions that turned out better than expected become likelier. But nothing is gained by a ratio
+    # outside of the clipping range: the rollout says little about a policy that is far away.
+    clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+    pg_loss = -torch.min(ratio * mb["advantage"], clipped_ratio * mb["advantage"]).mean()
+
+    # The critic learns the return, which is its own estimate plus the advantage. [code] also
+    # limits how far the value may move from the rollout's: by clip_coef, in units of value.
+    error = (value - mb["return"]).square()
+    if args.clip_vloss:
+        step = (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
+        error = torch.max(error, (mb["value"] + step - mb["return"]).square())
+    v_loss = 0.5 * error.mean()
+
+    # The regulariser *entropy bonus*: it keeps more than one available action likely.
+    entropy = entropy.mean()
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
-    parts = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy)
-    parts["clip_fraction"] = ((ratio - 1).abs() > args.clip_coef).float().mean()
-    parts["approx_kl"] = (ratio - 1 - logratio).mean()  # E[r - 1 - log r]
-    return loss, parts
+
+    numbers = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy)
+    numbers["clip_fraction"] = (ratio != clipped_ratio).float().mean()
+    numbers["approx_kl"] = (ratio - 1 - logratio).mean()  # how far the policy has moved
+    return loss, numbers
 
 
-def update(agent: Agent, optimizer, batch: dict, ent_coef: float, args: Args) -> dict[str, float]:
-    """PPO's epochs over one rollout; returns the parts of the loss."""
-    b = {k: v.flatten(0, 1) for k, v in batch.items()}  # (T, N, ...) -> (T * N, ...)
-    # Only training actions were on offer: only their rows of P are computed.
-    row = torch.zeros(len(agent.table), dtype=torch.int64, device=agent.table.device)
-    row[agent.train_ids] = torch.arange(len(agent.train_ids), device=row.device)
-    b["available"] = row[b["available"]]  # (T * N, K)
-    everyones = torch.cat(everyone(b["advantage"]))  # published code: of the whole rollout
-    b["advantage"] = (b["advantage"] - everyones.mean()) / (everyones.std() + 1e-5)
-    size, parameters = args.minibatch_size // WORLD_SIZE, list(agent.parameters())
-    for _ in range(args.update_epochs):
-        for mb_inds in torch.randperm(len(b["value"]), device=row.device).split(size):
-            mb = {k: v.index_select(0, mb_inds) for k, v in b.items()}
-            P = agent.project_actions(agent.train_ids)  # (n, H)
-            loss, parts = ppo_loss(agent, mb, P, ent_coef, args)
+def update(agent, optimizer, batch, ent_coef):
+    """PPO's passes over one rollout; returns the numbers of the last minibatch."""
+    # From here on it does not matter which step and which environment a row came from.
+    flat = {name: x.flatten(0, 1) for name, x in batch.items()}  # (T, N, ...) -> (T * N, ...)
+    # Advantages are normalised over the whole rollout [code], with those of all processes.
+    advantages = torch.cat(gather_from_all(flat["advantage"].cpu()))
+    flat["advantage"] = (flat["advantage"] - advantages.mean()) / (advantages.std() + 1e-5)
+    parameters = list(agent.parameters())
+    for _ in range(agent.args.update_epochs):
+        order = torch.randperm(len(flat["value"]), device=agent.table.device)
+        for mb_inds in order.split(agent.args.minibatch_size // WORLD_SIZE):
+            mb = {name: x.index_select(0, mb_inds) for name, x in flat.items()}
+            loss, numbers = ppo_loss(agent, mb, ent_coef)
             optimizer.zero_grad()
             loss.backward()
-            for p in parameters if WORLD_SIZE > 1 else ():  # equal shares: their mean
-                dist.all_reduce(p.grad)
-                p.grad /= WORLD_SIZE
-            nn.utils.clip_grad_norm_(parameters, 0.5)  # published code
+            if WORLD_SIZE > 1:  # torchrun: the mean of all gradients
+                for p in parameters:
+                    sum_over_all(p.grad)
+                    p.grad /= WORLD_SIZE
+            nn.utils.clip_grad_norm_(parameters, MAX_GRAD_NORM)
             optimizer.step()
-    return {name: part.item() for name, part in parts.items()}  # of the last one
+    return {name: number.item() for name, number in numbers.items()}
 
 
-def everyone(x) -> list:
-    """Everyone's `x`, in the order of the ranks; all of them wait here.
-
-    torchrun: each process (rank) plays its share of the environments, and learns from its share
-    of each minibatch. Rank 0 alone evaluates, writes and speaks.
-    """
-    parts = [x] * WORLD_SIZE
-    if WORLD_SIZE > 1:
-        dist.all_gather_object(parts, x)
-    return [p.to(x.device) if isinstance(x, torch.Tensor) else p for p in parts]
-
-
-# ---- what is on offer, what is known about it, and what cannot be trained ----
-OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}  # of envs
-ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
-
-
-def seeds(n: int, *stream: int) -> list[int]:
-    """`n` seeds of one stream of random numbers, independent of all other streams."""
-    # It is named by the seed and by: 1 training, 2 PyTorch, 3 validation, 4 test, 5 evaluate.
-    return np.random.SeedSequence(stream).generate_state(n).tolist()
-
-
-def task_options(args: Args) -> dict:
-    """The options of this environment, out of the flags."""
-    return {name: getattr(args, name) for name in OPTIONS.get(args.env, ())}
-
-
-def make_envs(args: Args, pool, num_envs: int, num_available: int, *stream: int):
-    """Environments that offer `num_available` actions of `pool` per episode."""
-    make_vec = hvae.load_environment(args.env).make_vec
-    envs = make_vec(num_envs, pool, num_available, list(stream), **task_options(args))
-    return RecordEpisodeStatistics(envs)
-
-
-def action_pools(args: Args) -> tuple[dict[str, tuple], np.ndarray]:
-    """(Sorted ids, K on offer) of each phase; all ids (n,) on offer in training."""
-    # "learn" is the training itself; "train", "valid", "test" are evaluations. What learns from one
-    # set is scored on it (published code), and after adaptation on nothing else.
-    module = hvae.load_environment(args.env)
-    split = module.split_actions(args.split, args.split_seed)
-    pool, K = split["test" if args.adapt else "train"], args.num_available
-    eval_K = args.eval_available or K
-    no_op = [module.NO_OP] if hasattr(module, "NO_OP") else []  # CREATE
-    one_set = args.method == "nearest-neighbor" or args.adapt or not args.subsample
-    if one_set:
-        if args.fixed_set_size and args.method != "nearest-neighbor":
-            rng = np.random.default_rng(42)  # published code
-            pool = np.sort(rng.choice(pool, args.fixed_set_size, replace=False))
-        K = len(pool) + len(no_op)
-    phases = {"learn": (pool, K), "train": (pool, K if one_set else eval_K)}
-    phases |= {} if args.adapt else {p: (split[p], eval_K) for p in ("valid", "test")}
-    for phase, (ids, k) in phases.items():
-        if k > len(ids) + len(no_op):
-            raise ValueError(f"{k} on offer out of {len(ids) + len(no_op)} actions ({phase})")
-    return phases, np.union1d(no_op, pool).astype(np.int64)
-
-
-def load_table(args: Args) -> np.ndarray:
-    """The representations (A, D); trains the encoder if they are not there yet."""
-    if args.finetune:
-        return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
-    kind, _, variant = args.representation.partition("-")
-    if kind == "engineered":
-        options = dict(variant=variant) if variant else {}
-        options |= dict(fully_observable=True) if args.fully_observable else {}
-        return hvae.load_environment(args.env).engineered_representations(**options)
-    path, wanted = Path(args.representation), {}
-    if args.representation in ENCODERS:
-        # One table serves all policy seeds, as published: the encoder's seed stays 0.
-        same = {k: getattr(args, k) for k in ("split", "split_seed", "device", "runs_dir")}
-        encoder = hvae.default_args(args.env, args.hvae_recipe, args.modality)
-        encoder = replace(encoder, **same, **ENCODERS[args.representation])
-        path, wanted = hvae.representation_path(encoder), vars(encoder)
-        if not path.exists():
-            print(f"no {path} yet: training the encoder first", flush=True)
-            hvae.train(encoder)
-    loaded = hvae.load_representation(path, args.env, args.split, args.split_seed)
-    if stale := [k for k in wanted if loaded["config"].get(k, wanted[k]) != wanted[k]]:
-        raise ValueError(f"{path} has another {stale[0]} than the recipe: delete it")
-    return loaded["mean"]
-
-
-def check(args: Args) -> None:
-    """Refuse, before anything is made, what cannot be trained or has no effect."""
-    for name, value in vars(args).items():
-        least = int(type(value) is int and "seed" not in name)
-        if type(value) in (int, float) and not value >= least:
-            raise ValueError(f"{name} cannot be {value}")
-    size = args.minibatch_size * args.num_minibatches
-    if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
-        raise ValueError(f"{size} steps: no multiple of num_envs, or of {WORLD_SIZE} processes")
-    if not 2 <= size <= args.total_timesteps:
-        raise ValueError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
-    env, nearest, is_ours = args.env, args.method == "nearest-neighbor", args.method == "utility"
-    learned, default = args.representation in ENCODERS, default_args(env, args.recipe, args.quick)
-    one_set = nearest or args.adapt or not args.subsample
-    effects = {  # flags: whether they change anything; a run is named after them
-        "modality": learned,
-        "hvae_recipe": learned and not args.finetune,
-        "task subgoal_reward": env == "create",
-        "placement": env == "stacking",
-        "fully_observable": env == "recsys" and args.representation == "engineered",
-        "representation": env == "gridworld" or not args.representation.startswith("engineered-"),
-        "ent_floor": args.ent_coef > 0,
-        "num_available": not one_set or not (args.eval_available or args.adapt),
-        "eval_available": not args.adapt,
-        "subsample": not nearest and not args.adapt,  # these have one set anyway
-        "device": args.device != "cuda" or torch.cuda.is_available(),
-        "fixed_set_size": one_set and not nearest,
-        "aux_conditioned": env == "create" or args.placement in ("1d", "2d"),
-        "one_hot": env not in ("recsys", "create", "stacking"),  # states of integers
-        "ink": env not in ("gridworld", "recsys"),  # pictures
-        "bilinear": is_ours,
-        "small_gains": is_ours and not args.bilinear or args.aux_conditioned,
-    }
-    for flags, has_effect in effects.items():
-        for flag in flags.split() if not has_effect else ():
-            if getattr(args, flag) != getattr(default, flag):
-                raise ValueError(f"{flag} {getattr(args, flag)} has no effect or sense here")
-    if args.finetune:
-        theirs = load(Path(args.finetune) / "best.pt")["args"]
-        same = "env method representation modality split split_seed fully_observable placement"
-        for name in f"{same} hidden_size one_hot bilinear ink aux_conditioned".split():
-            if (there := getattr(theirs, name)) != getattr(args, name):
-                raise ValueError(f"{args.finetune} cannot be fine-tuned: its {name} is {there!r}")
-
-
-# ---- Algorithm 1: the training loop ----
-def train(args: Args) -> dict:
-    """Learn, select on validation actions, test once; returns what results.json holds."""
-    from torch.utils.tensorboard import SummaryWriter  # takes 1.5 s
-
+def train(args):
+    """Algorithm 1, then the test; returns what results.json holds."""
+    # Which actions are available in which phase, and their representations. If there is no table
+    # yet, rank 0 trains the encoder while the others wait.
     check(args)
-    cuda = args.device != "cpu" and torch.cuda.is_available()
-    device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if cuda else "cpu")
-    N, batch_size = args.num_envs // WORLD_SIZE, args.minibatch_size * args.num_minibatches
-    phases, train_ids = action_pools(args)
-    pool, K = phases.pop("learn")
-    envs = make_envs(args, pool, N, K, args.seed, 1)
-    folder, table, checkpoint = everyone(None if RANK else open_run(args))[0]
-    torch.manual_seed(seeds(1, args.seed, 2, RANK)[0])
-    agent = Agent(envs, table, train_ids, args).to(device)
-    if args.finetune:  # published code: discrete outputs are actions, so they are new
-        theirs, own = load(Path(args.finetune) / "best.pt")["agent"], agent.state_dict()
-        new = ("train_ids", *["head.", "fc_stop."] * (args.method == "nearest-neighbor"))
-        agent.load_state_dict({k: (own if k.startswith(new) else theirs)[k] for k in own})
-    agent.load_state_dict(everyone(agent.state_dict())[0])  # rank 0's
-    optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
-    reward_stats, G = RunningMeanStd().to(device), torch.zeros(N, device=device)
-    generator = torch.cuda if cuda else torch
-    update_index, seconds, best_score, size = 0, 0.0, -math.inf, 0
-    if checkpoint:
-        for name, part in dict(agent=agent, optimizer=optimizer, rewards=reward_stats).items():
-            part.load_state_dict(checkpoint[name])
-        generator.set_rng_state(checkpoint["generators"][RANK])
-        update_index, seconds, best_score, size = checkpoint["progress"]
-    num_updates = args.total_timesteps // batch_size
-    eval_every = max(1, args.eval_every // batch_size)  # in updates
-    decay_updates = max(1, (args.lr_decay_steps or args.total_timesteps) // batch_size)
-    metrics = io.StringIO() if RANK else open(folder / "metrics.csv", "a", buffering=1)
-    metrics.seek(metrics.truncate(size))  # what came after the checkpoint is made again
-    writer = None if RANK else SummaryWriter(folder, purge_step=update_index * batch_size)
-    obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
-    while update_index < num_updates:
-        began = time.perf_counter()
-        left = 1 - min(1.0, update_index / decay_updates)
-        lr = args.learning_rate * (0.1 + 0.9 * left)  # D.2; published code: to 0.1
-        optimizer.param_groups[0]["lr"] = lr
-        ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * left)
+    phases, train_ids = action_phases(args)
+    folder = gather_from_all(claim_folder(args) if RANK == 0 else None)[0]
+    table = gather_from_all(load_table(args) if RANK == 0 else None)[0]
 
-        # Collect: every episode draws its own subset of the training actions.
-        batch, obs, episodes = rollout(envs, obs, agent, batch_size // args.num_envs)
+    # Environments, networks, optimiser. Environments draw from other streams of random numbers than
+    # weights and actions do.
+    device = choose_device(args)
+    N = args.num_envs // WORLD_SIZE
+    envs, _ = make_envs(args, phases["learn"], N, (args.seed, 1))
+    torch.manual_seed(args.seed)
+    agent = Agent(envs, table, train_ids, args).to(device)
+    if args.finetune:
+        start_from(agent, Path(args.finetune))
+    agent.load_state_dict(gather_from_all(agent.state_dict())[0])  # rank 0's weights for all
+    optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
+    reward_stats = RunningMeanStd().to(device)
+
+    # --resume: everything that changes while training comes from the last checkpoint.
+    learned = dict(agent=agent, optimizer=optimizer, reward_stats=reward_stats)
+    path = folder / "checkpoint.pt"
+    step = 0
+    seconds = 0.0
+    best_score = -math.inf
+    log_size = 0  # of metrics.csv
+    if args.resume and path.exists():
+        checkpoint = load(path)
+        put(checkpoint, path, **learned)
+        step, seconds, best_score, log_size = checkpoint["progress"]
+    log = Log(args, folder, step, log_size) if RANK == 0 else None
+
+    rollout_size = args.minibatch_size * args.num_minibatches  # steps in a rollout
+    last_step = args.total_timesteps // rollout_size * rollout_size
+    eval_steps = max(1, args.eval_every // rollout_size) * rollout_size
+    decay_steps = args.lr_decay_steps or args.total_timesteps
+    starts_afresh = True
+    while step < last_step:
+        started = time.perf_counter()
+        if starts_afresh:
+            # At the beginning and after every checkpoint, all random numbers and all episodes start
+            # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
+            # Episodes still running are cut off; GAE has taken V of their last state for the rest.
+            torch.manual_seed(seeds(1, args.seed, 2, step, RANK)[0])
+            obs, _ = envs.reset(seed=seeds(N, args.seed, 1, step, RANK))
+            G = torch.zeros(N, device=device)  # discounted return of each environment so far
+
+        # The learning rate falls linearly (D.2), to a tenth [code]. So may the entropy bonus
+        # [here]: exploring is wanted early; late in training a random action can cost the episode.
+        left = 1 - min(1.0, step / decay_steps)
+        learning_rate = args.learning_rate * (LR_FLOOR + (1 - LR_FLOOR) * left)
+        ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * left)
+        optimizer.param_groups[0]["lr"] = learning_rate
+
+        # Collect. The regulariser *subsampling* works here: at every reset each environment draws
+        # its own K available actions out of the training actions (make_envs told it the pool and K)
+        # and shows their ids in obs["available"]. The policy cannot count on any one action, so it
+        # has to read the representations. (--no-subsample: K is all of them.)
+        batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
+
+        # Judge. Rewards are divided by the standard deviation of the discounted return, so that
+        # values have one size in all environments. [code] does not do so with pictures.
         rewards = batch["reward"]
-        if not agent.is_image:  # published code: only vectors
+        if not agent.is_image:
             returns, G = discounted_returns(rewards, batch["done"], G, args.gamma)
             reward_stats.update(returns.flatten())
             rewards = (rewards / reward_stats.mean_std()[1]).clamp(-10, 10)
         with torch.no_grad():
-            next_value = agent.encode(agent.see(obs)[0])[1]  # (N,)
+            _, next_value = agent.encode(agent.to_tensors(obs)[0])  # (N,)
         batch["advantage"] = gae(rewards, batch["value"], batch["done"], next_value, args.gamma)
         batch["return"] = batch["advantage"] + batch["value"]
 
-        # Learn. Then the normaliser catches up: what collects is what learns.
-        row = update(agent, optimizer, batch, ent_coef, args)
-        if not (agent.is_image or args.one_hot or args.finetune):  # C.2: frozen
+        # Learn. The statistics of the states follow afterwards, because the policy that learns has
+        # to be the one that collected; while fine-tuning they stay as they were [code].
+        numbers = update(agent, optimizer, batch, ent_coef)
+        if not (agent.is_image or args.one_hot or args.finetune):
             agent.obs_stats.update(batch["state"].flatten(0, 1))
         if not all(p.isfinite().all() for p in agent.parameters()):
-            raise ValueError(f"learning_rate {args.learning_rate} is too high: NaN")
-        update_index += 1
-        row |= dict(step=update_index * batch_size, learning_rate=lr)
-        row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
-        if episodes := sum(everyone(episodes), []):
-            row |= zip(COLUMNS[5:8], np.mean(episodes, 0), strict=True)
+            raise UserError(
+                f"infinite or NaN weights: is learning_rate {args.learning_rate} too high?"
+            )
+        step += rollout_size
 
-        # Select: the best on validation actions [adaptation: on what it adapts to].
-        is_checkpoint = update_index % eval_every == 0 or update_index == num_updates
-        state = dict(args=vars(args), agent=agent.state_dict(), step=row["step"])
-        if is_checkpoint and not RANK:
-            for k, phase in enumerate([phase for phase in phases if phase != "test"]):
-                played = phases[phase], args.valid_episodes, (args.seed, 3, update_index, k)
-                row[f"{phase}_score"] = score = evaluate(agent, *played)["score"]
-            if score > best_score:
-                best_score = score
-                hvae.write(folder / "best.pt", partial(torch.save, state))
-        row["sps"] = batch_size / (time.perf_counter() - began)
-        row["seconds"] = seconds = seconds + time.perf_counter() - began
-        record(row, metrics, writer)
-        if is_checkpoint:
-            state |= dict(optimizer=optimizer.state_dict(), rewards=reward_stats.state_dict())
-            state["progress"] = update_index, seconds, best_score, metrics.tell()
-            state["generators"] = everyone(generator.get_rng_state())
-            if not RANK:
-                hvae.write(folder / "checkpoint.pt", partial(torch.save, state))
-            # Episodes start afresh: a resumed run repeats an unbroken one.
-            obs, _ = envs.reset(seed=seeds(N, args.seed, 1, update_index, RANK))
-            G = torch.zeros_like(G)
+        # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
+        # with actions which neither encoder nor policy was trained on. Test actions are not looked
+        # at before the end. (The best of many noisy scores is a bit too good; the test is not. A
+        # policy that adapts, C.2, has only the actions it adapts to.)
+        is_checkpoint = step % eval_steps == 0 or step == last_step
+        train_score = None
+        valid_score = None
+        if is_checkpoint and RANK == 0:
+            stream = (args.seed, 3, step)
+            train_score = evaluate(agent, phases["train"], args.valid_episodes, stream)["score"]
+            valid_score = train_score
+            if not args.adapt:
+                valid_score = evaluate(agent, phases["valid"], args.valid_episodes, stream)["score"]
+            if valid_score > best_score:
+                best_score = valid_score
+                best = dict(args=vars(args), step=step, agent=agent.state_dict())
+                hvae.write(folder / "best.pt", partial(torch.save, best))
+
+        # Record what happened; scores of episodes come from all processes.
+        lasted = time.perf_counter() - started
+        seconds += lasted
+        score, total, length = episode_means(sum(gather_from_all(episodes), []))
+        row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)
+        row.update(train_score=train_score, valid_score=valid_score, learning_rate=learning_rate)
+        row.update(episode_score=score, episode_return=total, episode_length=length, **numbers)
+        row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
+        if RANK == 0:
+            log_size = log.write(row)
+            if is_checkpoint:
+                checkpoint = {name: part.state_dict() for name, part in learned.items()}
+                checkpoint["args"] = vars(args)
+                checkpoint["progress"] = (step, seconds, best_score, log_size)
+                hvae.write(path, partial(torch.save, checkpoint))
+        starts_afresh = is_checkpoint
     envs.close()
-    return {} if RANK else finish(folder, agent, phases, num_updates * batch_size, seconds)
+    if RANK:
+        return {}
+
+    # Test, once (Algorithm 2): the selected policy, frozen, with actions it has never met.
+    log.close()
+    return finish(folder, agent, phases, step, seconds)
 
 
 # ---- Algorithm 2: acting with new actions ----
-def evaluate(agent: Agent, offer: tuple, episodes: int, stream: tuple, greedy=False) -> dict:
-    """Score of the frozen policy; `offer` is (sorted ids, K on offer), `stream`: see `seeds`."""
-    # published code: the first 5,000 episodes to finish in 40 environments; we: as many in each,
-    # because those that finish first are the short ones
+
+
+def evaluate(agent, phase, episodes, stream):
+    """The frozen policy with actions of a phase, (action_pool, K): means over `episodes` episodes.
+
+    Nothing is learned here; new actions only bring their rows of the table. Every episode has its
+    own K of them. Actions are drawn, as in training, not the likeliest taken [code]. `stream` names
+    the random numbers, see `seeds`. Returns score, its standard error over episodes (the paper's is
+    over 5 seeds, 8 in Grid World), return, length, episodes.
+    """
+    torch.manual_seed(seeds(1, *stream)[0])
+    # 40 environments [code]. [code] counts the first 5,000 episodes to end, which favours short
+    # ones; [here] each environment plays the same number.
     N = min(episodes, 40)
-    quota, results = episodes // N + (np.arange(N) < episodes % N), []  # left to play, (N,)
-    envs = make_envs(agent.args, offer[0], N, offer[1], *stream)
-    (obs, _), P = envs.reset(), agent.project_actions()
-    while (quota > 0).any():
-        _, done, ended, obs = step(envs, obs, agent, P, greedy)
-        results += [*ended[done & (quota > 0)]] if done.any() else []
-        quota = quota - done
+    to_play = np.full(N, episodes // N)
+    to_play[: episodes % N] += 1
+    envs, obs = make_envs(agent.args, phase, N, stream)
+    played = []
+    while to_play.any():
+        _, obs, infos = play_step(envs, obs, agent)
+        for episode in ended_episodes(infos, agent.args):
+            number = episode[0]
+            if to_play[number] > 0:
+                to_play[number] -= 1
+                played.append(episode)
     envs.close()
-    score, total, length = np.mean(results, 0).tolist()
-    stderr = float(np.std(results, 0)[0] / math.sqrt(episodes))
-    return dict(score=score, stderr=stderr, length=length, episodes=episodes) | {"return": total}
+    stderr = np.std([score for _, score, *_ in played]) / math.sqrt(episodes)
+    score, total, length = episode_means(played)
+    means = {"score": score, "return": total, "length": length}
+    return dict(means, stderr=float(stderr), episodes=episodes)
 
 
-# ---- what a run leaves behind ----
-METHODS = {  # of published_results.csv, and what sets each apart from ours
-    "nearest_neighbor": ("method", "nearest-neighbor"),
-    "continuous_output": ("method", "continuous"),
-    "ours_no_subsampling": ("subsample", False),
-    "ours_no_entropy": ("ent_coef", 0.0),
-    "oracle_encoder_all_actions": ("representation", "hvae-all"),
-    "non_hierarchical_vae": ("representation", "vae"),
-    "engineered": ("representation", "engineered"),
-    "ours_alternate_modality": ("modality", "onehot"),
-    "ours_video": ("modality", "video"),
-    "ours_full_split": ("split", "full"),
-    "ours_conditioned_auxiliary": ("aux_conditioned", True),
-    "ours_no_subgoal_reward": ("subgoal_reward", False),
-    "ours_no_place": ("placement", "none"),
-    "ours_2d_place": ("placement", "2d"),
+# ---- which actions are available, and what is known about them ----
+
+# Options that an environment's make_vec takes, by their names in Args.
+OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}
+# How the encoders of --representation differ from hvae.py's defaults.
+ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
+
+
+def seeds(n, *stream):
+    """`n` seeds of one stream of random numbers, independent of all other streams."""
+    # A stream is named by the run's seed and by what it is for: 1 training environments, 2 PyTorch,
+    # 3 evaluations while training, 4 the final test, 5 the command `evaluate`, 6 pictures.
+    return np.random.SeedSequence(stream).generate_state(n).tolist()
+
+
+def task_options(args):
+    """The options of this environment's make_vec."""
+    return {name: getattr(args, name) for name in OPTIONS.get(args.env, ())}
+
+
+def with_no_op(action_pool, args):
+    """The pool and CREATE's no-op (A.3), which is available in every episode [code]."""
+    no_op = getattr(hvae.load_environment(args.env), "NO_OP", None)
+    return action_pool if no_op is None else np.union1d(action_pool, [no_op])
+
+
+def make_envs(args, phase, num_envs, stream):
+    """Environments for a phase, (action_pool, K available), and their first observation."""
+    action_pool, K = phase
+    make_vec = hvae.load_environment(args.env).make_vec
+    envs = make_vec(num_envs, action_pool, K, list(stream), **task_options(args))
+    envs = RecordEpisodeStatistics(envs)
+    obs, _ = envs.reset()
+    if not np.isin(obs["available"], with_no_op(action_pool, args)).all():
+        raise UserError("a reset makes actions available that are not in its action_pool")
+    return envs, obs
+
+
+def action_phases(args):
+    """For each phase (action_pool, K); and all ids (n,) that can be available while training.
+
+    UserError if parts of the split overlap, or if a pool has fewer than K actions.
+    """
+    split = hvae.load_environment(args.env).split_actions(args.split, args.split_seed)
+    ids = np.concatenate([split["train"], split["valid"], split["test"]])
+    if len(np.unique(ids)) < len(ids):
+        raise UserError(f"parts of split {args.split!r} overlap: unseen actions would be seen")
+
+    # "learn": the policy is trained; "train": it is scored on the same actions; "valid": selects
+    # the checkpoint; "test": scored once, at the end. K random actions of the pool are available in
+    # an episode: num_available in "learn", eval_available elsewhere. Three cases learn with a fixed
+    # set instead, all of it available all the time, and "train" scores them on it: nearest
+    # neighbour (which has an output per action), the ablation without subsampling, and C.2.
+    action_pool = split["test"] if args.adapt else split["train"]
+    K = args.num_available
+    eval_K = args.eval_available or K
+    train_K = eval_K
+    if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
+        if args.fixed_set_size and args.method != "nearest-neighbor":
+            rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
+            size = min(args.fixed_set_size, len(action_pool))
+            action_pool = np.sort(rng.choice(action_pool, size, replace=False))
+        K = train_K = len(with_no_op(action_pool, args))
+    phases = {"learn": (action_pool, K), "train": (action_pool, train_K)}
+    if not args.adapt:
+        phases.update(valid=(split["valid"], eval_K), test=(split["test"], eval_K))
+    for phase, (pool, k) in phases.items():
+        if not 1 <= k <= len(with_no_op(pool, args)):
+            raise UserError(
+                f"{k} available actions: phase {phase!r} has {len(with_no_op(pool, args))}"
+            )
+    return phases, with_no_op(action_pool, args)
+
+
+def load_table(args):
+    """The representations (A, D); trains the encoder if its table is not there yet."""
+    if args.finetune:  # the policy goes on with the table it knows
+        return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
+    if args.representation.startswith("engineered"):
+        module = hvae.load_environment(args.env)
+        options = {}
+        if "-" in args.representation:
+            options["variant"] = args.representation.partition("-")[2]
+        if args.fully_observable:
+            options["fully_observable"] = True
+        table = module.engineered_representations(**options)
+        if len(table) != module.NUM_ACTIONS or not np.isfinite(table).all():
+            raise UserError(f"engineered_representations: not {module.NUM_ACTIONS} finite rows")
+        return table
+    path = Path(args.representation)
+    if path.suffix == ".npz":
+        return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
+
+    # The encoder learns from training actions only (but for "hvae-all"); then it encodes all of
+    # them. One table serves all seeds of the policy, as published: the encoder's seed stays 0.
+    encoder = hvae.default_args(args.env, args.hvae_recipe, args.modality)
+    changes = dict(split=args.split, split_seed=args.split_seed)
+    changes.update(runs_dir=args.runs_dir, device=args.device, **ENCODERS[args.representation])
+    encoder = replace(encoder, **changes)
+    path = hvae.representation_path(encoder)
+    if not path.exists():
+        print(f"no {path} yet: training the encoder first", flush=True)
+        hvae.train(encoder)
+    return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
+
+
+def start_from(agent, folder):
+    """C.2: take over the weights of a trained policy."""
+    theirs = load(folder / "best.pt")
+    for name in ("env", "method", "split", "split_seed"):
+        there = getattr(theirs["args"], name)
+        if there != getattr(agent.args, name):
+            raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
+    if agent.args.method == "nearest-neighbor":
+        # Its outputs are actions, so they start anew; [code] does so with the stop head, too.
+        own = agent.state_dict()
+        anew = [name for name in own if name.startswith(("head.", "fc_stop."))]
+        theirs["agent"].update({name: own[name] for name in anew})
+    put(theirs, folder, agent=agent)
+
+
+def choose_device(args):
+    """The device of --device; under torchrun, each process has a GPU of its own."""
+    if args.device == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+
+
+def check(args):
+    """UserError, before anything is written, for what cannot be trained."""
+    module = hvae.load_environment(args.env)
+    names = dict(split="SPLITS", task="TASKS", placement="PLACEMENTS")
+    for option, allowed in names.items():
+        value = getattr(args, option)
+        if value is not None and hasattr(module, allowed):
+            hvae.choose(option, value, getattr(module, allowed))
+    if not args.representation.endswith(".npz"):
+        variants = [f"engineered-{variant}" for variant in getattr(module, "VARIANTS", ())]
+        allowed = [*ENCODERS, "engineered", *variants, "FILE.npz"]
+        hvae.choose("representation", args.representation, allowed)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device cuda: PyTorch finds no GPU here")
+    # A rollout is cut into whole steps of all environments, and into equal shares of processes.
+    size = args.minibatch_size * args.num_minibatches
+    if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
+        processes = f"{WORLD_SIZE} processes, as minibatch_size"
+        raise UserError(f"num_envs {args.num_envs}: it must divide {size} and suit {processes}")
+    if not 2 <= size <= args.total_timesteps:
+        raise UserError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
+    action_phases(args)
+
+
+# ---- the run's folder ----
+
+FREE = ("runs_dir", "run_name", "resume", "device")  # these do not make another run
+TESTED = {"train": "seen", "valid": "validation", "test": "unseen"}  # phases and their titles
+PUBLISHED = {  # HVAE (recsys: engineered) + utility: seen, unseen (published_results.csv)
+    "gridworld": (0.904, 0.703),
+    "recsys": (0.322, 0.197),
+    "create": (0.907, 0.797),  # push
+    "stacking": (2.354, 1.716),
 }
-FREE = "runs_dir run_name resume device".split()  # they make no other result
-APART = "env task fully_observable recipe quick seed bilinear adapt finetune".split()
 
 
-def describe(args: Args) -> tuple[str, str, dict]:
-    """The experiment, the method, all else that is not as in the recipe."""
-    default = vars(default_args(args.env, args.recipe, args.quick))
-    others = {k: v for k, v in vars(args).items() if v != default[k] and k not in FREE + APART}
-    found = [m for m, change in METHODS.items() if change in others.items()]
-    if found:
-        del others[METHODS[found[0]][0]]
-    method = found[0] if found else "ours"
-    # C.2; from which run is not in the name: a second one is refused
-    method += "_finetuned" if args.finetune else "_from_scratch" * args.adapt
-    method += "_bilinear" * (args.bilinear and args.method == "utility")  # not the paper's
-    experiment = args.env, args.task, "full" if args.fully_observable else None
-    return "-".join(filter(None, experiment)), method, others
+def run_name_of(args):
+    """<env>[-<option>-<value>]*-s<seed>, with the options that differ from the recipe."""
+    usual = vars(default_args(args.env, args.recipe, args.quick))
+    usual = dict(usual, recipe="fast", quick=False)
+    words = [hvae.environment_name(args.env)]
+    for name, value in vars(args).items():
+        if value != usual[name] and name not in ("seed", *FREE):
+            words.append(name if value is True else f"{name}-{value}")
+    # Only what every file system takes, and no more of it than it takes.
+    return re.sub("[^A-Za-z0-9._-]", "_", "-".join(words))[:120] + f"-s{args.seed}"
 
 
-def run_path(args: Args) -> Path:
-    """<runs_dir>/<env>[-task][-full]-<method>[-quick][-paper][-<option>-<value>]*-s<seed>."""
-    *parts, others = describe(args)
-    parts += ["quick"] * args.quick + ["paper"] * (args.recipe == "paper")
-    parts += [f"{k}-{v}".replace("/", "_") for k, v in others.items()]
-    return Path(args.runs_dir) / (args.run_name or "-".join([*parts, f"s{args.seed}"]))
+def claim_folder(args):
+    """The run's folder, new or to be resumed; no other process may write there as long as we live.
+
+    UserError if another process does, if there is a checkpoint but no --resume, or if --resume
+    comes with other options than the run was started with.
+    """
+    name = args.run_name or run_name_of(args)
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,139}", name):
+        raise UserError(f"run_name {name!r}: at most 140 letters, digits and . _ - are allowed")
+    folder = Path(args.runs_dir) / name
+    folder.mkdir(parents=True, exist_ok=True)
+    # Two processes in one folder would mix their rows. A lock of the operating system ends with its
+    # process, however that ends.
+    lock = FileLock(folder / ".lock", is_singleton=True)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise UserError(f"{folder} is in use by another process") from None
+    atexit.register(lock.release)
+    path = folder / "checkpoint.pt"
+    if path.exists() and not args.resume:
+        raise UserError(f"{folder} exists: --resume goes on with it, --run-name keeps both")
+    if path.exists():
+        for name, there in vars(load(path)["args"]).items():
+            if there != getattr(args, name) and name not in FREE:
+                raise UserError(f"cannot resume {folder}: its {name} is {there!r}")
+    return folder
 
 
-def published_scores(args: Args) -> dict[str, float]:
-    """Published mean per phase of this method, {} where there is none."""
-    _, method, others = describe(args)
-    if others.keys() & {flag for flag, _ in METHODS.values()}:
-        return {}  # two changes at once: nobody has published that
-    text = (Path(__file__).parent / "results" / "published_results.csv").read_text()
-    key = args.env + "_full" * args.fully_observable, method
-    rows = [r for r in csv.DictReader(text.splitlines()) if (r["env"], r["method"]) == key]
-    return {r["phase"]: float(r["mean"]) for r in rows if r["task"] in ("", args.task)}
+def load(path):
+    """A checkpoint, its "args" as Args; UserError if it is missing, damaged or of other code."""
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)  # runs no code
+        checkpoint["args"] = Args(**checkpoint["args"])
+    except Exception as e:  # for damaged files torch has a dozen kinds of errors
+        reason = str(e).split("\n")[0]
+        hint = "the run's folder is expected"
+        raise UserError(f"{path} is no checkpoint of this script, {hint}: {reason}") from None
+    return checkpoint
 
 
-def open_run(args: Args) -> tuple[Path, np.ndarray, dict | None]:
-    """Claim the run's folder: it, the representations, the checkpoint to go on from."""
-    # The new folder is the claim; without representations it is given back.
-    folder = run_path(args)
-    saved, path = folder / "args.json", folder / "checkpoint.pt"
-    if is_new := not (args.resume and saved.exists()):
+def put(checkpoint, path, **learned):
+    """Copy a checkpoint's states into agent, optimiser, ...; UserError names what does not fit."""
+    for name, part in learned.items():
         try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            raise ValueError(f"{folder} exists; --resume goes on with it") from None
-        hvae.write(saved, lambda file: file.write(json.dumps(vars(args), indent=1).encode()))
-    for name, there in json.loads(saved.read_text()).items():
-        if name not in FREE and there != (here := getattr(args, name, None)):
-            raise ValueError(f"cannot resume {folder}: {name} is {there!r} there, {here!r} here")
-    try:
-        return folder, load_table(args), load(path) if path.exists() else None
-    except BaseException:
-        if is_new:
-            saved.unlink()
-            folder.rmdir()
-        raise
+            part.load_state_dict(checkpoint[name])
+        except RuntimeError as e:
+            reason = str(e).split("\n")[-1].strip()
+            raise UserError(f"{path} does not fit this script and its options: {reason}") from None
 
 
-def load(path: Path) -> dict:
-    """A checkpoint, its "args" as Args. No code in it is run; ValueError if damaged."""
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        return checkpoint | dict(args=Args(**checkpoint["args"]))
-    except Exception as e:  # torch has a dozen kinds of errors
-        raise ValueError(f"{path} is no checkpoint: {type(e).__name__}") from None
+class Log:
+    """A run's metrics.csv, TensorBoard events and progress bar."""
+
+    def __init__(self, args, folder, step, size):
+        from torch.utils.tensorboard import SummaryWriter  # here, because it takes 1.5 s
+
+        text = json.dumps(vars(args), indent=1)
+        hvae.write(folder / "args.json", lambda file: file.write(text.encode()))
+        self.file = open(folder / "metrics.csv", "a", encoding="utf-8", newline="")
+        self.file.truncate(size)  # rows after the checkpoint are made again
+        self.file.seek(size)
+        self.writer = SummaryWriter(folder, purge_step=step)
+        print(f"run: {folder}", flush=True)
+        steps = dict(total=args.total_timesteps, initial=step)
+        self.bar = tqdm(**steps, unit="step", unit_scale=True, disable=None)  # only on a terminal
+
+    def write(self, row):
+        """A row for one rollout, scores onto the screen; returns the size of metrics.csv."""
+        table = csv.DictWriter(self.file, row.keys(), lineterminator="\n")
+        if self.file.tell() == 0:
+            table.writeheader()
+        table.writerow(row)
+        self.file.flush()
+        for name, x in row.items():
+            if x is not None:
+                self.writer.add_scalar(name, x, row["step"])
+        self.bar.update(row["step"] - self.bar.n)
+        if row["train_score"] is not None:
+            scores = "seen {train_score:.3f}, validation {valid_score:.3f}".format(**row)
+            self.bar.set_postfix_str(scores)
+            self.bar.write(f"step {row['step']:,}: {scores}")
+        return self.file.tell()
+
+    def close(self):
+        self.bar.close()
+        self.file.close()
+        self.writer.close()
 
 
-COLUMNS = "step seconds sps train_score valid_score".split()
-COLUMNS += "episode_score episode_return episode_length pg_loss v_loss entropy".split()
-COLUMNS += "clip_fraction approx_kl learning_rate explained_variance".split()
-
-
-def record(row: dict, metrics, writer) -> None:
-    """A row into metrics.csv and TensorBoard, scores onto the screen (rank 0)."""
-    table = csv.DictWriter(metrics, COLUMNS, lineterminator="\n")
-    if metrics.tell() == 0:
-        table.writeheader()
-    table.writerow({k: v if k == "step" else f"{v:.6g}" for k, v in row.items()})
-    for name, value in row.items() if writer else ():
-        writer.add_scalar(name, value, row["step"])
-    if scores := [f"{k[:5]} {row[k]:.3f}" for k in ("train_score", "valid_score") if k in row]:
-        print(f"step {row['step']:,}: {', '.join(scores)}", flush=True)
-
-
-def finish(folder: Path, agent: Agent, phases: dict, steps: int, seconds: float) -> dict:
-    """Test the best checkpoint, once; write results.json; then draw and print."""
-    args, best = agent.args, load(folder / "best.pt")
-    agent.load_state_dict(best["agent"])
-    experiment, method, _ = describe(args)
-    launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
-    words = [Path(sys.argv[0]).name, *(word for word in sys.argv[1:] if word != "--resume")]
+def finish(folder, agent, phases, step, seconds):
+    """Test the best checkpoint; write results.json; then draw pictures and print the scores."""
+    args = agent.args
+    # Results are written first. Whatever goes wrong with a picture afterwards, they are safe.
+    best = load(folder / "best.pt")
+    put(best, folder, agent=agent)
     metric = hvae.load_environment(args.env).METRIC
-    results = dict(metric=metric, method=method, published=published_scores(args), ceiling={})
-    results |= dict(steps=steps, best_step=best["step"], hours=seconds / 3600, seed=args.seed)
-    results["command"] = f"{launcher} {shlex.join(words)}"
-    for k, (phase, offer) in enumerate(phases.items()):
-        results[phase] = evaluate(agent, offer, args.eval_episodes, (args.seed, 4, k))
-        if experiment in CEILINGS and offer[1] == PRESETS[args.env].num_available:
-            results["ceiling"][phase] = CEILINGS[experiment][phase != "train"]
+    launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
+    words = [Path(sys.argv[0]).name, *sys.argv[1:]]
+    results = dict(metric=metric, seed=args.seed, command=f"{launcher} {shlex.join(words)}")
+    results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
+    titles = {"train": "adapted to"} if args.adapt else TESTED
+    for phase in titles:
+        results[phase] = evaluate(agent, phases[phase], args.eval_episodes, (args.seed, 4))
     text = json.dumps(results, indent=1)
     hvae.write(folder / "results.json", lambda file: file.write(text.encode()))
     try:
-        plot_curve(folder, results)
-        record_episode(agent, offer, folder / "episode.gif", args.seed)
-    except Exception as e:  # whatever it is, the results are safe
+        plot_curve(folder, metric)
+        record_episode(agent, phases["train" if args.adapt else "test"], folder / "episode.gif")
+    except Exception as e:
         print(f"note: a picture is missing: {type(e).__name__}: {e}")
-    print(f"\n{metric:10} {'ours':>14} {'published':>10} {'ceiling':>8}   ({method})")
-    names = ["adapted to"] if args.adapt else ["seen", "validation", "unseen"]
-    for phase, name in zip(phases, names, strict=True):
-        others = (results[key].get(phase) for key in ("published", "ceiling"))
-        published, ceiling = ("-" if x is None else f"{x:.3f}" for x in others)
-        ours = "{score:7.3f} ±{stderr:.3f}".format(**results[phase])
-        print(f"{name:10} {ours} {published:>10} {ceiling:>8}")
-    print(f"curve, episode, metrics and checkpoints: {folder}/")
+
+    print(f"\n{metric}, mean and standard error of {args.eval_episodes} episodes")
+    for phase, title in titles.items():
+        print("{:10} {score:7.3f} +- {stderr:.3f}".format(title, **results[phase]))
+    if args.env in PUBLISHED and args.task in (None, "push"):
+        print("the paper's main method: seen {}, unseen {}".format(*PUBLISHED[args.env]))
+    print(f"curve, episode, metrics and checkpoints: {folder}")
     return results
 
 
-def plot_curve(folder: Path, results: dict) -> None:
-    """Scores over steps as curve.png, raw: not held at their maximum."""
-    os.environ.pop("MPLBACKEND", None)  # a notebook's can end the import
-    from matplotlib.figure import Figure  # not pyplot: that would look for a display
+def plot_curve(folder, metric):
+    """C.7, Figure 14: scores over steps; not held at their maximum, as the published ones are."""
+    os.environ.pop("MPLBACKEND", None)  # one inherited from a notebook ends the import
+    from matplotlib.figure import Figure  # not pyplot, which looks for a display
 
-    rows = [r for r in csv.DictReader((folder / "metrics.csv").open()) if r["train_score"]]
-    axes = (figure := Figure(figsize=(6, 4), layout="tight")).subplots()
-    for name in [n for n in ("train_score", "valid_score") if rows[0][n]]:
-        points = [(int(row["step"]) / 1e6, float(row[name])) for row in rows]
-        axes.plot(*zip(*points, strict=True), marker=".", label=name)
-    axes.set(xlabel="million steps", ylabel=results["metric"], ylim=(0, None))
+    rows = np.genfromtxt(folder / "metrics.csv", delimiter=",", names=True, encoding="utf-8")
+    rows = rows[~np.isnan(rows["train_score"])]
+    figure = Figure(figsize=(6, 4), layout="tight")
+    axes = figure.subplots()
+    for column in ("train_score", "valid_score"):
+        axes.plot(rows["step"] / 1e6, rows[column], marker=".", label=column)
+    axes.set(xlabel="million steps", ylabel=metric, ylim=(0, None))
     axes.legend(frameon=False)
     hvae.write(folder / "curve.png", lambda file: figure.savefig(file, format="png", dpi=120))
 
 
-def record_episode(agent: Agent, offer: tuple, path: Path, seed: int) -> None:
+def record_episode(agent, phase, path):
     """Play one episode and save it as a GIF, in colour."""
-    args, module = agent.args, hvae.load_environment(agent.args.env)
-    name = {"gridworld": "GridWorld", "recsys": "RecSys"}.get(args.env, args.env.capitalize())
-    env = getattr(module, f"{name}Env")(*offer, render_mode="rgb_array", **task_options(args))
-    envs = SyncVectorEnv([lambda: env], autoreset_mode=AutoresetMode.DISABLED)
-    (obs, _), P, done, frames = envs.reset(seed=seed), agent.project_actions(), [False], []
-    frames += [env.render()]
-    while not done[0]:
-        _, done, _, obs = step(envs, obs, agent, P)
+    envs, obs = make_envs(agent.args, phase, 1, (agent.args.seed, 6))
+    # Not to be reset at the end of the episode, or its last pictures would be lost.
+    envs.unwrapped.autoreset_mode = AutoresetMode.DISABLED
+    env = envs.unwrapped.envs[0].unwrapped
+    env.render_mode = "rgb_array"
+    obs, _ = envs.reset()
+    frames = env.render_frames()
+    done = False
+    while not done:
+        transition, obs, _ = play_step(envs, obs, agent)
+        done = bool(transition["done"])
         frames += env.render_frames()
     envs.close()
+    module = hvae.load_environment(agent.args.env)
     module.save_gif(path, frames, fps=env.metadata["render_fps"])
 
 
-# ---- python ppo_actiongen.py evaluate RUN: other sets, the analyses of A.3 ----
+# ---- python ppo_actiongen.py evaluate RUN: other available actions, and the analyses of A.3 ----
+
+
 @dataclass
 class EvaluateArgs:
-    """Score best.pt of a run with any actions."""
+    """Test the policy of a run with other available actions; also the analyses of A.3."""
 
-    run: tyro.conf.Positional[str]  # folder of the run
-    actions: Literal["train", "valid", "test"] = "test"  # which of them are on offer
-    num_available: int | None = None  # K (None: as in the run's own test)
-    min_angle_gap: float | None = None  # CREATE: degrees to training tools
-    min_embedding_distance: str | None = None  # squared; or a quantile: q0.5
-    unseen_ratio: float | None = None  # this share, the rest training actions
-    greedy: bool = False  # take the likeliest choice and the mean position
-    episodes: int = 5000  # to play
-    seed: int = 0  # of environments and policy
-    save: bool = False  # into evaluations.csv in the run's folder
-    gif: str | None = None  # play an episode into this file
+    run: tyro.conf.Positional[str]  # the run's folder
+    actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
+    num_available: int | None = None  # K; None: as in the run's own test
+    min_angle_gap: float | None = None  # CREATE: only tools at least this many degrees away
+    min_embedding_distance: float | None = None  # a share, .3: without the 30 % nearest to training
+    unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
+    episodes: int = 5000  # episodes to play
+    save: bool = False  # append the scores to evaluations.csv in the run's folder
+    gif: str | None = None  # record one episode in this file, NAME.gif
 
 
-def restrict_pool(options: EvaluateArgs, table, pool, known) -> np.ndarray:
-    """The analyses of A.3: which of `pool` (m,) are on offer; `known` (n,) were trained on."""
-    analyses = options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio
-    gap, distance, ratio = analyses
-    if analyses != (None, None, None) and np.isin(pool, known).any():
-        raise ValueError("the analyses choose among unseen actions")
-    if gap is not None:
-        pool = pool[hvae.load_environment("create").angle_gaps(pool, known) >= gap]
-    if distance is not None:
-        squared = torch.cdist(table[pool].double(), table[known].double()).amin(1).square().numpy()
-        # published: absolute distances, which depend on the encoder
-        least = float(distance.removeprefix("q"))
-        least = np.quantile(squared, least) if distance[0] == "q" else least
-        pool = pool[squared >= least]
-    if ratio is not None:  # of two pools of one size, so that it is that of what is on offer
-        rng, size = np.random.default_rng(options.seed), min(len(pool), len(known))
-        count = round(ratio * size)
-        unseen = rng.choice(pool, count, replace=False)
-        pool = np.union1d(unseen, rng.choice(known, size - count, replace=False))
+def restrict_pool(options, module, table, pool, known):
+    """The pool (m,) of unseen ids for an analysis of A.3; `known` (n,) were trained on."""
+    analyses = (options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio)
+    if analyses == (None, None, None):
+        return pool
+    if np.isin(pool, known).any():
+        raise UserError("the analyses choose among unseen actions")
+    for share in analyses[1:]:
+        if share is not None and not 0 <= share <= 1:
+            raise UserError(f"{share} is no share between 0 and 1")
+    if options.min_embedding_distance is not None:
+        # Squared distance to the nearest representation of a training action. The published limits
+        # fit the scale of one encoder; a share of the pool means the same for all of them.
+        distances = torch.cdist(table[pool].double(), table[known].double())  # (m, n)
+        squared = distances.amin(1).square().numpy()
+        pool = pool[squared >= np.quantile(squared, options.min_embedding_distance)]
+    if options.min_angle_gap is not None:
+        # Only tools that differ by so much from every training tool's angle.
+        if not hasattr(module, "angle_gaps"):
+            raise UserError("min_angle_gap: only the tools of CREATE have angles")
+        pool = pool[module.angle_gaps(pool, known) >= options.min_angle_gap]
+    if options.unseen_ratio is not None:
+        # A mixture as large as the smaller side, whatever the share, so that only the share differs
+        # between two evaluations. The same mixture for all runs: seed 0.
+        rng = np.random.default_rng(0)
+        size = min(len(pool), len(known))
+        num_unseen = round(options.unseen_ratio * size)
+        unseen = rng.choice(pool, num_unseen, replace=False)
+        pool = np.union1d(unseen, rng.choice(known, size - num_unseen, replace=False))
     return pool
 
 
-def evaluate_run(options: EvaluateArgs) -> dict:
-    """Score a finished run, print it, and write what --save and --gif ask for."""
-    best = load(Path(options.run) / "best.pt")
-    args, weights, stream = best["args"], best["agent"], (options.seed, 5)
-    phases, train_ids = action_pools(args)
-    pool, K = phases["train" if args.adapt else options.actions]  # adapted: to the test actions
-    if options.episodes < 1:
-        raise ValueError(f"episodes cannot be {options.episodes}")
-    for flag in ["min_angle_gap"] * (args.env != "create") + ["actions"] * args.adapt:
-        if (value := getattr(options, flag)) not in (None, "test"):
-            raise ValueError(f"{flag} {value} has no effect or sense here")
-    pool = restrict_pool(options, weights["table"], pool, phases["learn"][0])
-    offer = pool, min(K, len(pool)) if options.num_available is None else options.num_available
-    envs = make_envs(args, pool, 1, offer[1], *stream)
-    agent = Agent(envs, weights["table"].numpy(), train_ids, args)
+def evaluate_run(options):
+    """Score a run's best checkpoint, print it, and write what --save and --gif ask for."""
+    if options.gif and not options.gif.endswith(".gif"):
+        raise UserError(f"gif {options.gif}: the name has to end in .gif")
+    folder = Path(options.run)
+    best = load(folder / "best.pt")
+    args = best["args"]
+    table = best["agent"]["table"]
+    phases, train_ids = action_phases(args)
+    phase = "train" if args.adapt else options.actions
+    pool, K = phases[phase]
+    K = K if options.num_available is None else options.num_available
+    module = hvae.load_environment(args.env)
+    pool = restrict_pool(options, module, table, pool, phases["learn"][0])
+    most = len(with_no_op(pool, args))
+    if not 1 <= K <= most:
+        raise UserError(f"{K} available actions are asked for, but the pool has {most}")
+
+    # The policy as it was trained, but with other actions: that is all of Algorithm 2.
+    stream = (args.seed, 5)
+    envs, _ = make_envs(args, (pool, K), 1, stream)
+    agent = Agent(envs, table.numpy(), train_ids, args)
     envs.close()
-    agent.load_state_dict(weights)
-    torch.manual_seed(seeds(1, *stream)[0])
-    result = evaluate(agent, offer, options.episodes, stream, options.greedy)
-    print(f"{options.actions} actions, K={offer[1]}, {options.episodes} episodes: ", end="")
-    print(f"{result['score']:.4f} ± {result['stderr']:.4f} (pool of {len(pool)})")
+    put(best, folder, agent=agent)
+    result = evaluate(agent, (pool, K), options.episodes, stream)
+    title = "adapted to" if args.adapt else options.actions
+    print(f"{title}: {K} of {most} actions available, {options.episodes} episodes")
+    print(module.METRIC + " {score:.4f} +- {stderr:.4f}".format(**result))
+
     if options.save:
-        path = Path(options.run) / "evaluations.csv"
-        keys = [k for k in vars(options) if k not in ("run", "save", "gif")]
-        row = vars(options) | dict(num_available=offer[1], pool_size=len(pool)) | result
-        row = {k: "" if row[k] is None else str(row[k]) for k in [*keys, "pool_size", *result]}
-        old = csv.DictReader(path.read_text().splitlines()) if path.exists() else ()
-        rows = [r for r in old if any(r[k] != row[k] for k in keys)] + [row]
-        text = "\n".join([",".join(row), *(",".join(r.values()) for r in rows), ""])
-        hvae.write(path, lambda file: file.write(text.encode()))
+        # `best_step` tells which checkpoint was scored: an unfinished run may still find a better.
+        row = dict(vars(options), num_available=K, pool_size=len(pool), **result)
+        row["best_step"] = best["step"]
+        with open(folder / "evaluations.csv", "a", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow(row)
     if options.gif:
-        record_episode(agent, offer, Path(options.gif), options.seed)
+        record_episode(agent, (pool, K), Path(options.gif))
+        print(f"episode: {options.gif}")
     return result
 
 
-def main(words: list[str]) -> None:
-    """Train what the command line says, or evaluate what was trained."""
-    # ours: for layers this small a second thread waits more than it works
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 1)))
-    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        # Keep freed memory for the next array: else CREATE takes 1.2 (paper: 2.3) times as long.
-        libc.mallopt(-1, 2**31 - 1), libc.mallopt(-3, 2**31 - 1)  # M_TRIM_, M_MMAP_THRESHOLD
-    if words[:1] == ["evaluate"]:
-        return evaluate_run(tyro.cli(EvaluateArgs, args=words[1:]))
-    # Three words decide the defaults, so the line is read twice.
+# ---- the command line ----
+
+
+def parse_args(words):
+    """Args of a command line."""
+    # Environment, recipe and quick decide all other defaults, so the line is read twice.
     first = tyro.cli(Args, args=[word for word in words if word not in ("-h", "--help")])
     default = default_args(first.env, first.recipe, first.quick)
-    args = tyro.cli(Args, args=words or ["--help"], default=default)
+    args = tyro.cli(Args, args=words, default=default, description=__doc__)
+    return replace(args, env=default.env)  # an own file by its absolute path
+
+
+def main(words):
+    """Train what the command line says, or evaluate what was trained."""
+    torch.set_num_threads(1)  # for layers this small a second thread waits more than it works
+    if words[:1] == ["evaluate"]:
+        prog = "ppo_actiongen.py evaluate"
+        return evaluate_run(tyro.cli(EvaluateArgs, args=words[1:], prog=prog))
+    args = parse_args(words or ["--help"])
     if WORLD_SIZE > 1:  # the others may wait for hours while rank 0 trains an encoder
         dist.init_process_group("gloo", timeout=timedelta(days=3))
         atexit.register(dist.destroy_process_group)
-    train(args)
+    return train(args)
 
 
 if __name__ == "__main__":
     try:
         main(sys.argv[1:])
-    except (ValueError, OSError) as e:
+    except UserError as e:  # a mistake of the user's; one of the program's keeps its traceback
         raise SystemExit(f"error: {e}") from None
+    except OSError as e:
+        if e.errno not in (errno.ENOSPC, errno.EACCES):
+            raise
+        raise SystemExit(f"error: {e.strerror}: {e.filename or 'the run'}") from None
