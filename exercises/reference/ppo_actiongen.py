@@ -1,0 +1,1349 @@
+"""PPO with a policy over changing sets of actions: train, validate, test on unseen actions.
+
+An ordinary policy has one output per action, so it cannot use an action it was not trained with.
+This one reads a *representation* c_i of every action, a vector that hvae.py makes from recordings
+of what the action does. A utility function f_nu gives one number to a pair of state and action, and
+a softmax turns the numbers of the available actions into probabilities:
+
+    pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
+
+A new action is then just another vector. The policy must not learn the training actions by heart,
+so there are three regularisers, marked *so* below: *subsampling*, every episode has its own random
+subset of the training actions; an *entropy bonus*; and *validation*, the policy that is kept is the
+one that does best with actions held out for this choice.
+
+Baselines: `nearest-neighbor` has an output per training action and executes the available action
+nearest to the one it drew; `continuous` draws a point in the space of representations and executes
+the available action nearest to it; `--representation vae` takes a VAE without hierarchy (B).
+Ablations: `--ent-coef 0`, `--no-subsample`. Appendix C: C.1 `--task`; C.2 `--finetune`, `--adapt`;
+C.3 `--no-subgoal-reward`; C.4 `--aux-conditioned`; C.5 `--fully-observable`; C.6 `--placement`,
+`--split full`; C.7 curve.png of every run. A.3's analyses: `create --split analysis
+--representation hvae-all`, then `evaluate RUN --min-angle-gap 9` and its other options.
+
+    python ppo_actiongen.py gridworld --quick         # minutes; or: recsys, create, stacking
+    python ppo_actiongen.py gridworld --recipe paper  # the policy of Tables 3 and 4
+    python ppo_actiongen.py gridworld --method nearest-neighbor
+    python ppo_actiongen.py gridworld --finetune runs/gridworld-s0     # C.2
+    python ppo_actiongen.py my_env.py                 # an environment of your own: see README.md
+    python ppo_actiongen.py evaluate runs/gridworld-s0 --num-available 20  # see evaluate --help
+
+In the order of this file: hyper-parameters (Tables 3 and 4; lengths of episodes and states are the
+environments'); torchrun; networks (D.3.2, C.4); the main paper's Algorithm 1, training, and
+Algorithm 2, acting with unseen actions; then what surrounds them: which actions are available,
+checks, the run's folder, the command `evaluate` (A.3), the command line.
+
+Letters in shapes: T steps of a rollout, N environments, B rows of a batch, K available actions,
+A all actions, D numbers in a representation, H hidden units. The *code* of a state is f_omega(s). A
+step is one action of one environment. A *score* is the environment's METRIC at the end of an
+episode (success, click-through rate, height), a return the sum of its rewards. Two marks: [code] is
+the authors' released implementation, followed where the appendix is silent and in the few places
+that say so; [here] is a choice of this repository, with its reason.
+"""
+
+import atexit
+import csv
+import errno
+import json
+import math
+import os
+import re
+import shlex
+import sys
+import time
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import torch.distributed as dist
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from filelock import FileLock, Timeout
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from torch.distributions import Beta, Categorical, Distribution, Normal
+from tqdm import tqdm
+
+import hvae
+from hvae import UserError
+
+Distribution.set_default_validate_args(False)  # the checks cost as much as the draws
+
+
+# ---- Tables 3 and 4: the hyper-parameters ----
+
+
+# An option of your own touches at most four places: a line in Args; the layer, if it needs one, in
+# Agent.__init__; its use, in Agent.act or ppo_loss; and, if you want to watch it, a number in the
+# dictionary that ppo_loss returns, which becomes a column of metrics.csv. (An option of an
+# environment: a line in Args and its name in OPTIONS.) Switched off, it must not make a layer: a
+# new layer draws random numbers, and every run would change.
+@dataclass
+class Args:
+    """Train on training actions, select on validation actions, test on unseen ones."""
+
+    # --- experiment ---
+    env: Annotated[str, tyro.conf.Positional] = "gridworld"  # or recsys, create, stacking, FILE.py
+    recipe: Literal["fast", "paper"] = "fast"  # of the policy: FAST below, or Tables 3 and 4
+    quick: bool = False  # the same protocol in minutes, with fewer steps
+    method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # or a baseline
+    seed: int = 0  # one seed is one run, bit for bit, on one kind of CPU
+    adapt: bool = False  # train on the test actions, a fixed set of them (C.2)
+    finetune: str | None = None  # --adapt, starting from the policy in this run's folder (C.2)
+
+    # --- environment ---
+    split: str = "default"  # how actions are divided into training, validation and test
+    split_seed: int = 0  # seed of that division [code: one division for all seeds]
+    task: str | None = None  # CREATE: one of its twelve tasks (C.1)
+    subgoal_reward: bool = True  # CREATE: reward for the subgoal (off: C.3)
+    placement: str | None = None  # Stacking: who chooses where a shape falls: none, 1d, 2d (C.6)
+    fully_observable: bool = False  # Recommender: representations hold the popularity, too (C.5)
+
+    # --- action representations ---
+    # hvae-all is an encoder that was trained on all actions (the oracle); vae is B's baseline.
+    representation: str = "hvae"  # hvae, hvae-all, vae, engineered[-5d], or a table FILE.npz
+    modality: str | None = None  # what the encoder sees (B): xy, video, ...; None: the first
+    hvae_recipe: Literal["quick", "fast", "paper"] = "fast"  # how long the encoder is trained
+
+    # --- which actions are available ---
+    num_available: int = 50  # K while training (Table 3 "actions per episode")
+    eval_available: int | None = None  # K in evaluations; None: as while training
+    subsample: bool = True  # a random subset per episode; off: always all training actions
+    fixed_set_size: int | None = None  # --no-subsample or --adapt: only this many actions
+
+    # --- PPO (Table 4 unless it says otherwise) ---
+    # Table 3's "PPO batch size" is the size of a minibatch [code]. So CleanRL's num_steps is
+    # minibatch_size * num_minibatches / num_envs here.
+    total_timesteps: int = 40_000_000  # steps of the whole training (Table 3)
+    num_envs: int = 32  # environments side by side ("parallel processes")
+    minibatch_size: int = 4096  # steps in a minibatch (Table 3, "PPO batch size")
+    num_minibatches: int = 4  # minibatches in a rollout [code]
+    update_epochs: int = 4  # passes over one rollout
+    learning_rate: float = 1e-3  # of Adam, at the start
+    lr_decay_steps: int | None = None  # steps until it has fallen to a tenth; None: the whole run
+    gamma: float = 0.99  # discount factor of later rewards
+    clip_coef: float = 0.1  # clipping range of PPO's probability ratio
+    vf_coef: float = 0.5  # weight of the value loss
+    clip_vloss: bool = True  # clip the value's steps as well [code]
+    ent_coef: float = 0.05  # weight of the entropy bonus (Table 3); 0: w/o entropy
+    ent_floor: float = 1.0  # fraction of ent_coef left when the learning rate has fallen [here]
+
+    # --- networks ---
+    hidden_size: int = 64  # units in every hidden layer (Table 4)
+    published_init: bool = True  # initial weights of utility, position and stop as in [code]
+    aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
+    bilinear: bool = False  # utility c . M s in place of an MLP [here]
+    one_hot: bool = False  # integer states enter one-hot in place of as numbers [here]
+    small_pictures: bool = False  # half-size inverted pictures and three convolutions [here]
+
+    # --- evaluation ---
+    eval_every: int = 410_000  # steps between two evaluations
+    valid_episodes: int = 640  # episodes of one evaluation while training
+    eval_episodes: int = 5000  # episodes of the final test [code]
+
+    # --- run ---
+    runs_dir: str = "runs"  # folder of runs and representations
+    run_name: str | None = None  # name of the run's folder; None: see run_name_of
+    resume: bool = False  # go on from the last checkpoint, bit for bit
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
+
+    def __post_init__(self):
+        if self.finetune is not None:
+            self.adapt = True
+
+
+TABLE_3 = {
+    "env": ("gridworld", "recsys", "create", "stacking"),
+    "ent_coef": (0.05, 0.01, 0.005, 0.01),
+    "num_available": (50, 500, 50, 20),
+    "total_timesteps": (40_000_000, 40_000_000, 60_000_000, 3_000_000),
+    "minibatch_size": (4096, 2048, 3072, 1024),
+    # What else is not the same in all of them (A.2, B, C.6, [code]).
+    "representation": ("hvae", "engineered", "hvae", "hvae"),  # A.2: recsys provides them
+    "task": (None, None, "push", None),
+    "placement": (None, None, None, "1d"),
+    # [code]: longer than the run, so the rate falls to .46 (create) and .97 (stacking) only.
+    "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
+    "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
+    "eval_every": (410_000, 164_000, 615_000, 102_400),  # 25, 20, 50, 25 rollouts
+    "valid_episodes": (
+        640,
+        160,
+        640,
+        200,
+    ),  # stacking [code]: 40, too few to tell checkpoints apart
+}
+PRESETS = {}  # environment -> Args with its column of the table
+for number, environment in enumerate(TABLE_3["env"]):
+    PRESETS[environment] = Args(**{name: row[number] for name, row in TABLE_3.items()})
+
+AUX_ENT_SCALE = 0.1  # Table 3 "continuous entropy scaling"
+GAE_LAMBDA = 0.95  # [code]
+MAX_GRAD_NORM = 0.5  # [code]
+LR_FLOOR = 0.1  # [code]: the learning rate falls to this fraction
+
+# The fast recipe: every difference from Tables 3 and 4, all of them [here], with its reason.
+FAST = {
+    "gridworld": dict(
+        one_hot=True,  # a cell's id is a name, not a quantity
+        minibatch_size=512,  # eight times as many updates per step
+        num_available=20,  # favourites are often absent, so the others are tried
+        eval_available=50,  # tests keep the number of Table 3
+        ent_floor=0.1,  # late in training a random skill mostly ends in the lava
+        hidden_size=128,  # 64 units fit fewer skills
+        published_init=False,  # gradients of 1e-6 waste the first updates
+        total_timesteps=10_000_000,
+    ),
+    "recsys": dict(
+        bilinear=True,  # an MLP learns single products by heart
+        hidden_size=256,  # 64 units fit the user's taste less well
+        gamma=0.0,  # a click depends on this recommendation, hardly on earlier ones
+        minibatch_size=512,  # as in Grid World
+        num_available=100,  # a fifth of the cost of a step
+        eval_available=500,  # tests keep the number of Table 3
+        total_timesteps=10_000_000,
+    ),
+    "create": dict(
+        small_pictures=True,  # thin black lines on white: convolutions see mostly the white
+        aux_conditioned=True,  # a ramp and a cannon belong in different places
+        published_init=False,  # as in Grid World
+        lr_decay_steps=None,  # the rate falls over the run, whatever its length
+        hidden_size=256,  # which tool, and where: more to represent
+        minibatch_size=128,  # pictures are the cost, so many small updates ...
+        num_minibatches=16,
+        update_epochs=1,  # ... but each picture is used once: four passes move the policy too far
+        learning_rate=5e-4,  # smaller minibatches are noisier
+        clip_coef=0.2,  # goals are rare, so each of them may teach more
+        vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
+        clip_vloss=False,  # steps of clip_coef are too small for values near 10
+        total_timesteps=4_000_000,
+        eval_every=102_400,
+    ),
+    "stacking": dict(
+        published_init=False,  # as in Grid World
+        lr_decay_steps=None,  # as in CREATE
+        minibatch_size=32,  # physics is the cost, so learn more from each step
+        clip_vloss=False,  # as in CREATE
+        total_timesteps=400_000,
+        eval_every=20_500,
+    ),
+}
+# --quick: this many steps, at least four evaluations, 500 test episodes, the encoder's quick
+# recipe.
+QUICK = {"gridworld": 1_500_000, "recsys": 1_000_000, "create": 700_000, "stacking": 60_000}
+
+
+def default_args(env="gridworld", recipe="fast", quick=False):
+    """Table 3, then the fast recipe, then --quick; UserError for an unknown environment.
+
+    An environment of your own may hold DEFAULTS, a dictionary of fields of Args.
+    """
+    module = hvae.load_environment(env)
+    if env in PRESETS:
+        args = PRESETS[env]
+    else:  # the absolute path, so that `evaluate` and --resume find the file from everywhere
+        own = getattr(module, "DEFAULTS", {})
+        args = Args(env=str(Path(env).resolve()), **own)
+    args = replace(args, recipe=recipe, quick=quick)
+    if recipe == "fast":
+        args = replace(args, **FAST.get(env, {}))
+    if quick:
+        args.total_timesteps = QUICK.get(env, args.total_timesteps // 10)
+        args.eval_every = min(args.eval_every, args.total_timesteps // 4)
+        args.eval_episodes = 500
+        args.hvae_recipe = "quick"
+    return args
+
+
+# ---- torchrun: several processes that train one policy ----
+
+# Started by `torchrun --nproc_per_node=2 ppo_actiongen.py ...`, each process (its number is RANK)
+# plays its share of the environments and learns from its share of every minibatch. Gradients are
+# averaged, so all processes keep the same weights. Rank 0 alone evaluates, writes and prints.
+# Started by `python`, there is one process, and these two functions do nothing.
+RANK = int(os.environ.get("RANK", 0))
+WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
+
+
+def gather_from_all(x):
+    """The objects `x` of all processes, in the order of their ranks."""
+    gathered = [x] * WORLD_SIZE
+    if WORLD_SIZE > 1:
+        dist.all_gather_object(gathered, x)
+    return gathered
+
+
+def sum_over_all(x):
+    """Replace `x` by the sum over all processes."""
+    if WORLD_SIZE > 1:
+        dist.all_reduce(x)
+
+
+# ---- D.3.2: the networks ----
+
+
+def layer_init(layer, gain=2**0.5):
+    """Orthogonal weights of this gain, bias 0 [code]."""
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def mlp(inputs, H):
+    """f_omega of vectors, (B, inputs) -> (B, H). D.3.2: "2-layer MLP with tanh activation"."""
+    first = layer_init(nn.Linear(inputs, H))
+    second = layer_init(nn.Linear(H, H))
+    return nn.Sequential(first, nn.Tanh(), second, nn.Tanh())
+
+
+def cnn(frames, H, small):
+    """f_omega: pictures (B, frames, 84, 84) -> (B, H). D.3.2: "5-layer convolutional network".
+
+    small: pictures (B, frames, 42, 42), three layers [here].
+    """
+    # A stride of 2 halves the picture [code]: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side.
+    channels = [frames, 16, 16, 32, 32, 32]
+    features = 32 * 3 * 3
+    if small:
+        # [here] 42 -> 21 -> 11 -> 6. At 6 x 6 the features still show where the balls are.
+        channels = [frames, 16, 32, 64]
+        features = 64 * 6 * 6
+    layers = []
+    for before, after in pairwise(channels):
+        conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
+        if small:  # [code] keeps PyTorch's weights: all pictures give nearly the same output
+            layer_init(conv)
+        layers += [conv, nn.ReLU()]
+    layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
+    if small:  # so that it does not matter how many lines are drawn, only where
+        layers.append(nn.LayerNorm(features, elementwise_affine=False))
+    return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
+
+
+def small_inverted(frames):
+    """Pictures (N, C, 84, 84) uint8, black on white -> (N, C, 42, 42) uint8, 255 on 0."""
+    # The white background becomes 0. At the start of an episode, the stack of frames is padded with
+    # black ones; inverted they would be all 255, so they are set to 0.
+    is_real = frames.amax((2, 3), keepdim=True) > 0  # (N, C, 1, 1)
+    halved = F.avg_pool2d(frames.float(), 2)  # (N, C, 42, 42)
+    return ((255 - halved) * is_real).byte()
+
+
+class RunningMeanStd(nn.Module):
+    """Mean and standard deviation of all numbers seen so far, one each per element of `shape`."""
+
+    def __init__(self, shape=()):
+        super().__init__()
+        # Count, sum and sum of squares, as if 1e-4 numbers of variance 1 had been seen [code].
+        prior = [torch.full(shape, x, dtype=torch.float64) for x in (1e-4, 0.0, 1e-4)]
+        self.register_buffer("sums", torch.stack(prior))  # (3, *shape)
+
+    def update(self, x):
+        """Add a batch (n, *shape), and those of the other processes."""
+        x = x.double()
+        new = torch.stack([torch.ones_like(x), x, x.square()]).sum(1)  # (3, n, ...) -> (3, ...)
+        sum_over_all(new)
+        self.sums += new
+
+    def mean_std(self):
+        count, total, squares = self.sums
+        mean = total / count
+        variance = squares / count - mean.square() + 1e-8
+        return mean.float(), variance.sqrt().float()
+
+
+class Agent(nn.Module):
+    """The policy and the critic of D.3.2, or the policy of a baseline.
+
+    table (A, D): the representation of every action; it is never trained here. train_ids (n,): the
+    sorted ids of the actions that can be available while training.
+    """
+
+    def __init__(self, envs, table, train_ids, args):
+        super().__init__()
+        self.args = args
+        H = args.hidden_size
+        D = table.shape[1]
+        self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
+        self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
+
+        # f_omega and the critic V. With pictures they share the convolutions, else nothing [code].
+        state = envs.single_observation_space["state"]
+        self.is_image = len(state.shape) == 3
+        if self.is_image:
+            self.encoder = cnn(state.shape[0], H, args.small_pictures)
+            self.critic = layer_init(nn.Linear(H, 1))
+        else:
+            self.obs_stats = RunningMeanStd(state.shape)
+            width = math.prod(state.shape)
+            if args.one_hot:  # Grid World's first states hold all ids that there are
+                first_states = envs.reset()[0]["state"]
+                self.register_buffer("cell_ids", torch.as_tensor(first_states).unique())
+                width *= len(self.cell_ids)
+            self.encoder = mlp(width, H)
+            self.critic = nn.Sequential(mlp(width, H), layer_init(nn.Linear(H, 1)))
+
+        # CREATE and Shape Stacking have Dict actions: "choice", "position" and, in Stacking,
+        # "stop". Elsewhere an action is the choice alone, and action_parts is empty.
+        self.action_parts = getattr(envs.single_action_space, "spaces", {})
+
+        # What chooses among the available actions. [code] starts all three layers of the utility
+        # with a gain of 0.01. Gradients shrink on their way through them to about 1e-6, and
+        # learning starts late. [here, fast recipe] only the last layer is small.
+        project_gain, hidden_gain = (0.01, 0.01) if args.published_init else (1.0, 2**0.5)
+        has_mlp = args.method == "utility" and not args.bilinear
+        is_conditioned = args.aux_conditioned and "position" in self.action_parts
+        if has_mlp or is_conditioned:
+            self.action_project = layer_init(nn.Linear(D, H), project_gain)
+        if has_mlp:
+            self.utility_hidden = layer_init(nn.Linear(2 * H, H), hidden_gain)
+            self.utility_out = layer_init(nn.Linear(H, 1), 0.01)
+        elif args.method == "utility":
+            self.utility_query = layer_init(nn.Linear(H, D), 0.01)
+        elif args.method == "nearest-neighbor":  # a logit for each training action
+            self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01)
+        else:  # a Gaussian over representations
+            self.head_mean = layer_init(nn.Linear(H, D), 1.0)
+            self.head_var = layer_init(nn.Linear(H, D), 1.0)
+
+        # The auxiliary policy f_chi: where to place the action, whether to stop (D.3.2, A.4).
+        if "position" in self.action_parts:
+            self.fc_alpha = self.position_head()
+            self.fc_beta = self.position_head()
+        if "stop" in self.action_parts:
+            self.fc_stop = layer_init(nn.Linear(H, 2), 0.01)
+            # Outputs: 0 go on, 1 stop. Untrained, they are equally likely, and a tower ends after
+            # two shapes. The fast recipe starts with going on [here].
+            if not args.published_init:
+                nn.init.constant_(self.fc_stop.bias[0], 4.0)
+
+    def position_head(self):
+        """The layers behind alpha, or beta, of the Beta distribution over positions."""
+        H = self.args.hidden_size
+        dims = self.action_parts["position"].shape[0]
+        if not self.args.aux_conditioned:  # D.3.2: linear, from the code of the state
+            return layer_init(nn.Linear(H, dims), 1.0)
+        # C.4: two layers, from the code and the projected action (B, 2H). With [code]'s gain of 1
+        # each action has a favourite place of its own before training. [here] all start alike.
+        hidden = layer_init(nn.Linear(2 * H, H), 1.0)
+        last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
+        return nn.Sequential(hidden, nn.ReLU(), last)
+
+    def to_tensors(self, obs):
+        """An observation as tensors: states (N, ...) and ids of the available actions (N, K)."""
+        state = torch.as_tensor(obs["state"])
+        if self.args.small_pictures:
+            state = small_inverted(state)
+        available = torch.as_tensor(obs["available"])
+        return state.to(self.table.device), available.to(self.table.device)
+
+    def encode(self, state):
+        """States (B, ...) -> their codes f_omega(s) (B, H) and values V(s) (B,)."""
+        if self.is_image:  # grey levels 0..255 -> 0..1
+            code = self.encoder(state.float() / 255)
+            return code, self.critic(code).squeeze(1)
+        # Numbers are brought to mean 0 and standard deviation 1 [code]. If they are ids of cells, a
+        # number says less than a vector with a single 1 at the place of the id.
+        if self.args.one_hot:
+            number = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
+            x = F.one_hot(number, len(self.cell_ids)).flatten(1).float()  # (B, cells * ids)
+        else:
+            mean, std = self.obs_stats.mean_std()
+            x = ((state - mean) / std).clamp(-10, 10).flatten(1)  # [code]; (B, numbers)
+        return self.encoder(x), self.critic(x).squeeze(1)
+
+    def utility(self, code, available):
+        """f_nu (D.3.2): codes (B, H) and ids of available actions (B, K) -> logits (B, K)."""
+        if self.args.bilinear:  # [here] c . M s, where the layer utility_query is M
+            query = self.utility_query(code)  # (B, D)
+            return torch.einsum("bd,bkd->bk", query, self.table[available])
+
+        # How good is it to take the action with representation c in a state with code s? D.3.2 asks
+        #
+        #     hidden = ReLU(W [s; project(c)] + b),    logit = out(hidden).
+        #
+        # [s; project(c)] is the concatenation. Half of W's columns, W_s, meet s, the other half,
+        # W_c, meet project(c) = P c + p. So what is inside of the ReLU is a sum,
+        #
+        #     W [s; P c + p] + b  =  (W_s s + b)  +  (W_c P c + W_c p),
+        #
+        # of a part that is the same for all actions and a part that is the same for all states.
+        # Each is computed once; only their sum is formed for every pair. The logits are the same,
+        # at a fraction of the cost. (exercises/README.md, 2: write the concatenation.)
+        W_s, W_c = self.utility_hidden.weight.chunk(2, dim=1)  # (H, H) each
+        project = self.action_project
+        state_part = F.linear(code, W_s, self.utility_hidden.bias)  # (B, H)
+
+        # The action's part is needed for those U actions only that are available somewhere in this
+        # batch. `row_of_id` says where among them the action of an id stands.
+        occurs = torch.zeros(len(self.table), dtype=torch.bool, device=code.device)
+        occurs[available] = True
+        row_of_id = occurs.cumsum(0) - 1  # (A,)
+        weight = W_c @ project.weight  # (H, D): two linear maps in a row are one
+        bias = W_c @ project.bias  # (H,)
+        action_part = F.linear(self.table[occurs], weight, bias)  # (U, H)
+
+        # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
+        # into the processor's cache, so they are made in pieces of 800,000 numbers (3 MB) [here].
+        piece = max(1, 800_000 // (available.shape[1] * code.shape[1]))
+        logits = []
+        for states, rows in zip(
+            state_part.split(piece), row_of_id[available].split(piece), strict=True
+        ):
+            actions = action_part.index_select(0, rows.flatten())  # (b * K, H)
+            hidden = states[:, None] + actions.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
+            logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
+        return torch.cat(logits) + self.utility_out.bias
+
+    def choice_policy(self, code, available):
+        """What is drawn from: K logits or, in a baseline, n logits or a Gaussian."""
+        if self.args.method == "nearest-neighbor":  # one of the n training actions
+            return Categorical(logits=self.head(code))  # (B, n)
+        if self.args.method == "continuous":  # a point in the space of representations [code]
+            std = F.softplus(self.head_var(code)).sqrt()
+            return Normal(self.head_mean(code), std)  # (B, D)
+        return Categorical(logits=self.utility(code, available))  # (B, K)
+
+    def index_of(self, drawn, available):
+        """Which of the available actions is meant by what was drawn, (B,) in 0..K-1."""
+        if self.args.method == "utility":
+            return drawn
+        # A baseline takes the available action nearest to the training action, or to the point,
+        # that was drawn. This belongs to the environment: no gradient passes. (While
+        # nearest-neighbor is trained, all training actions are available, so it gets what it drew.)
+        if self.args.method == "nearest-neighbor":
+            drawn = self.table[self.train_ids[drawn]]  # (B,) -> (B, D)
+        difference = self.table[available] - drawn[:, None]  # (B, K, D) - (B, 1, D)
+        return difference.square().sum(2).argmin(1)
+
+    def act(self, state, available, action=None):
+        """Draw an action, or judge one that was drawn: CleanRL's `get_action_and_value`.
+
+        Returns action, log-probability, entropy and value, (B,) each. An action is a dictionary of
+        "drawn" (what came out of the distribution), "choice" (which of the K available actions that
+        means), "action_id" (its id), and "position" and "stop" where the environment has them.
+        """
+        # The policy is a product of up to three distributions: which action, where, and whether to
+        # stop. So their log-probabilities add up, and so do their entropies.
+        is_new = action is None
+        if is_new:
+            action = {}
+        code, value = self.encode(state)
+
+        # Which action.
+        policy = self.choice_policy(code, available)
+        if is_new:
+            action["drawn"] = policy.sample()
+            action["choice"] = self.index_of(action["drawn"], available)
+            action["action_id"] = available.gather(1, action["choice"][:, None]).squeeze(1)
+        logprob = policy.log_prob(action["drawn"])
+        entropy = policy.entropy()
+        if self.args.method == "continuous":
+            # D numbers were drawn. [code] adds up their entropies in Grid World and averages them
+            # elsewhere; [here] the mean, so that ent_coef means the same for every D.
+            logprob = logprob.sum(1).clamp(-1e5, 1e5)  # [code]: keeps ratios finite
+            entropy = entropy.mean(1)
+
+        # Where to place it: a Beta distribution for each dimension (D.3.2). With parameters above 1
+        # it has one peak, and never one at each border.
+        if "position" in self.action_parts:
+            x = code
+            if self.args.aux_conditioned:  # C.4
+                chosen = self.action_project(self.table[action["action_id"]])  # (B, H)
+                x = torch.cat([code, chosen], dim=1)  # (B, 2H)
+            place = Beta(1 + F.softplus(self.fc_alpha(x)), 1 + F.softplus(self.fc_beta(x)))
+            if is_new:
+                action["position"] = 2 * place.sample() - 1  # (B, dims), from [0, 1] to [-1, 1]
+            # float32 may round to the border, where the log-density is minus infinity.
+            unit = (0.5 + action["position"] / 2).clamp(1e-6, 1 - 1e-6)
+            logprob = logprob + place.log_prob(unit).sum(1)
+            entropy = entropy + AUX_ENT_SCALE * place.entropy().sum(1)
+
+        # Whether to stop here (A.4: "a binary episode termination action").
+        if "stop" in self.action_parts:
+            stop = Categorical(logits=self.fc_stop(code))
+            if is_new:
+                action["stop"] = stop.sample()
+            logprob = logprob + stop.log_prob(action["stop"])
+            entropy = entropy + stop.entropy()
+        return action, logprob, entropy, value
+
+
+# ---- Algorithm 1: training ----
+
+# 1. Train the encoder on training actions, then compute c_i for all actions (hvae.py).
+# 2. Repeat: at every reset draw K training actions; play; update by PPO with an entropy bonus;
+#    now and then score on validation actions, and keep the best policy.
+# Algorithm 2 is `evaluate`: the kept policy with K unseen actions per episode, nothing is learned.
+
+
+@torch.no_grad()
+def play_step(envs, obs, agent):
+    """One action in each of N environments: the transition, the next observation, the infos."""
+    # The environment wants the number of an available action, 0..K-1, and the other parts.
+    state, available = agent.to_tensors(obs)
+    action, logprob, _, value = agent.act(state, available)
+    executed = action["choice"].cpu().numpy()  # (N,)
+    if agent.action_parts:
+        executed = {name: action[name].cpu().numpy() for name in agent.action_parts}
+    obs, reward, terminated, truncated, infos = envs.step(executed)
+
+    # What was available is kept with the transition: the update needs the probability of the action
+    # among just these. Running out of time is an end like any other [code], since the limits are
+    # short and part of the task.
+    transition = dict(state=state, available=available, logprob=logprob, value=value, **action)
+    transition["reward"] = torch.as_tensor(reward).to(value)
+    transition["done"] = torch.as_tensor(terminated | truncated).to(value)  # 1.0 or 0.0
+    return transition, obs, infos
+
+
+def ended_episodes(infos, args):
+    """(number of the environment, score, return, length) of every episode that ended just now."""
+    # An environment whose episode ends is reset within the same step. What it said at the end is in
+    # "final_info"; return and length are added by gymnasium's RecordEpisodeStatistics.
+    if "episode" not in infos:
+        return []
+    metric = hvae.load_environment(args.env).METRIC
+    if metric not in infos.get("final_info", {}):
+        raise UserError(f"the last info of an episode does not hold the metric {metric!r}")
+    scores = infos["final_info"][metric]
+    episode = infos["episode"]
+    ended = np.flatnonzero(infos["_episode"])
+    return [(n, scores[n], episode["r"][n], episode["l"][n]) for n in ended]
+
+
+def episode_means(episodes):
+    """Mean score, return and length of `ended_episodes`; None for each if there are none."""
+    if not episodes:
+        return None, None, None
+    return np.mean(episodes, axis=0)[1:].tolist()
+
+
+def rollout(envs, obs, agent, num_steps):
+    """Play T steps: a batch of (T, N, ...) tensors, the next observation, the ended episodes."""
+    transitions = []
+    episodes = []
+    for _ in range(num_steps):
+        transition, obs, infos = play_step(envs, obs, agent)
+        transitions.append(transition)
+        episodes += ended_episodes(infos, agent.args)
+    batch = {name: torch.stack([t[name] for t in transitions]) for name in transitions[0]}
+    return batch, obs, episodes
+
+
+def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
+    """Generalised advantage estimation: how much better each step turned out than expected.
+
+    All are (T, N), next_value is (N,). With the surprise delta_t of one step,
+
+        delta_t = r_t + gamma (1 - done_t) V_{t+1} - V_t
+        A_t     = delta_t + gamma lam (1 - done_t) A_{t+1}
+
+    done_t says that *this* step ended the episode (CleanRL's is shifted by one step).
+    """
+    # Backwards, since each advantage contains the next one. After the last step of the rollout the
+    # critic says what is still to come.
+    advantages = torch.empty_like(rewards)
+    next_advantage = 0.0
+    for t in reversed(range(len(rewards))):
+        alive = 1.0 - dones[t]
+        delta = rewards[t] + gamma * alive * next_value - values[t]
+        next_advantage = delta + gamma * lam * alive * next_advantage
+        advantages[t] = next_advantage
+        next_value = values[t]
+    return advantages
+
+
+def discounted_returns(rewards, dones, G, gamma):
+    """G <- gamma G + r, step by step: all of them (T, N), and the G to go on with (N,)."""
+    returns = torch.empty_like(rewards)
+    for t in range(len(rewards)):
+        G = gamma * G + rewards[t]
+        returns[t] = G
+        G = G * (1.0 - dones[t])
+    return returns, G
+
+
+def ppo_loss(agent, mb, ent_coef):
+    """PPO's clipped loss of one minibatch, and the numbers of it that go into metrics.csv."""
+    # How much likelier is each action now than when it was played?
+    args = agent.args
+    action = {name: mb[name] for name in ("drawn", "action_id", *agent.action_parts)}
+    _, logprob, entropy, value = agent.act(mb["state"], mb["available"], action)
+    logratio = logprob - mb["logprob"]
+    ratio = logratio.exp()
+
+    # Actions that turned out better than expected become likelier. But nothing is gained by a ratio
+    # outside of the clipping range: the rollout says little about a policy that is far away.
+    clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+    pg_loss = -torch.min(ratio * mb["advantage"], clipped_ratio * mb["advantage"]).mean()
+
+    # The critic learns the return, which is its own estimate plus the advantage. [code] also
+    # limits how far the value may move from the rollout's: by clip_coef, in units of value.
+    error = (value - mb["return"]).square()
+    if args.clip_vloss:
+        step = (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
+        error = torch.max(error, (mb["value"] + step - mb["return"]).square())
+    v_loss = 0.5 * error.mean()
+
+    # The regulariser *entropy bonus*: it keeps more than one available action likely.
+    entropy = entropy.mean()
+    loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
+
+    numbers = dict(pg_loss=pg_loss, v_loss=v_loss, entropy=entropy)
+    numbers["clip_fraction"] = (ratio != clipped_ratio).float().mean()
+    numbers["approx_kl"] = (ratio - 1 - logratio).mean()  # how far the policy has moved
+    return loss, numbers
+
+
+def update(agent, optimizer, batch, ent_coef):
+    """PPO's passes over one rollout; returns the numbers of the last minibatch."""
+    # From here on it does not matter which step and which environment a row came from.
+    flat = {name: x.flatten(0, 1) for name, x in batch.items()}  # (T, N, ...) -> (T * N, ...)
+    # Advantages are normalised over the whole rollout [code], with those of all processes.
+    advantages = torch.cat(gather_from_all(flat["advantage"].cpu()))
+    flat["advantage"] = (flat["advantage"] - advantages.mean()) / (advantages.std() + 1e-5)
+    parameters = list(agent.parameters())
+    for _ in range(agent.args.update_epochs):
+        order = torch.randperm(len(flat["value"]), device=agent.table.device)
+        for mb_inds in order.split(agent.args.minibatch_size // WORLD_SIZE):
+            mb = {name: x.index_select(0, mb_inds) for name, x in flat.items()}
+            loss, numbers = ppo_loss(agent, mb, ent_coef)
+            optimizer.zero_grad()
+            loss.backward()
+            if WORLD_SIZE > 1:  # torchrun: the mean of all gradients
+                for p in parameters:
+                    sum_over_all(p.grad)
+                    p.grad /= WORLD_SIZE
+            nn.utils.clip_grad_norm_(parameters, MAX_GRAD_NORM)
+            optimizer.step()
+    return {name: number.item() for name, number in numbers.items()}
+
+
+def train(args):
+    """Algorithm 1, then the test; returns what results.json holds."""
+    # Which actions are available in which phase, and their representations. If there is no table
+    # yet, rank 0 trains the encoder while the others wait.
+    check(args)
+    phases, train_ids = action_phases(args)
+    folder = gather_from_all(claim_folder(args) if RANK == 0 else None)[0]
+    table = gather_from_all(load_table(args) if RANK == 0 else None)[0]
+
+    # Environments, networks, optimiser. Environments draw from other streams of random numbers than
+    # weights and actions do.
+    device = choose_device(args)
+    N = args.num_envs // WORLD_SIZE
+    envs, _ = make_envs(args, phases["learn"], N, (args.seed, 1))
+    torch.manual_seed(args.seed)
+    agent = Agent(envs, table, train_ids, args).to(device)
+    if args.finetune:
+        start_from(agent, Path(args.finetune))
+    agent.load_state_dict(gather_from_all(agent.state_dict())[0])  # rank 0's weights for all
+    optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
+    reward_stats = RunningMeanStd().to(device)
+
+    # --resume: everything that changes while training comes from the last checkpoint.
+    learned = dict(agent=agent, optimizer=optimizer, reward_stats=reward_stats)
+    path = folder / "checkpoint.pt"
+    step = 0
+    seconds = 0.0
+    best_score = -math.inf
+    log_size = 0  # of metrics.csv
+    if args.resume and path.exists():
+        checkpoint = load(path)
+        put(checkpoint, path, **learned)
+        step, seconds, best_score, log_size = checkpoint["progress"]
+    log = Log(args, folder, step, log_size) if RANK == 0 else None
+
+    rollout_size = args.minibatch_size * args.num_minibatches  # steps in a rollout
+    last_step = args.total_timesteps // rollout_size * rollout_size
+    eval_steps = max(1, args.eval_every // rollout_size) * rollout_size
+    decay_steps = args.lr_decay_steps or args.total_timesteps
+    starts_afresh = True
+    while step < last_step:
+        started = time.perf_counter()
+        if starts_afresh:
+            # At the beginning and after every checkpoint, all random numbers and all episodes start
+            # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
+            # Episodes still running are cut off; GAE has taken V of their last state for the rest.
+            torch.manual_seed(seeds(1, args.seed, 2, step, RANK)[0])
+            obs, _ = envs.reset(seed=seeds(N, args.seed, 1, step, RANK))
+            G = torch.zeros(N, device=device)  # discounted return of each environment so far
+
+        # The learning rate falls linearly (D.2), to a tenth [code]. So may the entropy bonus
+        # [here]: exploring is wanted early; late in training a random action can cost the episode.
+        left = 1 - min(1.0, step / decay_steps)
+        learning_rate = args.learning_rate * (LR_FLOOR + (1 - LR_FLOOR) * left)
+        ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * left)
+        optimizer.param_groups[0]["lr"] = learning_rate
+
+        # Collect. The regulariser *subsampling* works here: at every reset each environment draws
+        # its own K available actions out of the training actions (make_envs told it the pool and K)
+        # and shows their ids in obs["available"]. The policy cannot count on any one action, so it
+        # has to read the representations. (--no-subsample: K is all of them.)
+        batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
+
+        # Judge. Rewards are divided by the standard deviation of the discounted return, so that
+        # values have one size in all environments. [code] does not do so with pictures.
+        rewards = batch["reward"]
+        if not agent.is_image:
+            returns, G = discounted_returns(rewards, batch["done"], G, args.gamma)
+            reward_stats.update(returns.flatten())
+            rewards = (rewards / reward_stats.mean_std()[1]).clamp(-10, 10)
+        with torch.no_grad():
+            _, next_value = agent.encode(agent.to_tensors(obs)[0])  # (N,)
+        batch["advantage"] = gae(rewards, batch["value"], batch["done"], next_value, args.gamma)
+        batch["return"] = batch["advantage"] + batch["value"]
+
+        # Learn. The statistics of the states follow afterwards, because the policy that learns has
+        # to be the one that collected; while fine-tuning they stay as they were [code].
+        numbers = update(agent, optimizer, batch, ent_coef)
+        if not (agent.is_image or args.one_hot or args.finetune):
+            agent.obs_stats.update(batch["state"].flatten(0, 1))
+        if not all(p.isfinite().all() for p in agent.parameters()):
+            raise UserError(
+                f"infinite or NaN weights: is learning_rate {args.learning_rate} too high?"
+            )
+        step += rollout_size
+
+        # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
+        # with actions which neither encoder nor policy was trained on. Test actions are not looked
+        # at before the end. (The best of many noisy scores is a bit too good; the test is not. A
+        # policy that adapts, C.2, has only the actions it adapts to.)
+        is_checkpoint = step % eval_steps == 0 or step == last_step
+        train_score = None
+        valid_score = None
+        if is_checkpoint and RANK == 0:
+            stream = (args.seed, 3, step)
+            train_score = evaluate(agent, phases["train"], args.valid_episodes, stream)["score"]
+            valid_score = train_score
+            if not args.adapt:
+                valid_score = evaluate(agent, phases["valid"], args.valid_episodes, stream)["score"]
+            if valid_score > best_score:
+                best_score = valid_score
+                best = dict(args=vars(args), step=step, agent=agent.state_dict())
+                hvae.write(folder / "best.pt", partial(torch.save, best))
+
+        # Record what happened; scores of episodes come from all processes.
+        lasted = time.perf_counter() - started
+        seconds += lasted
+        score, total, length = episode_means(sum(gather_from_all(episodes), []))
+        row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)
+        row.update(train_score=train_score, valid_score=valid_score, learning_rate=learning_rate)
+        row.update(episode_score=score, episode_return=total, episode_length=length, **numbers)
+        row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
+        if RANK == 0:
+            log_size = log.write(row)
+            if is_checkpoint:
+                checkpoint = {name: part.state_dict() for name, part in learned.items()}
+                checkpoint["args"] = vars(args)
+                checkpoint["progress"] = (step, seconds, best_score, log_size)
+                hvae.write(path, partial(torch.save, checkpoint))
+        starts_afresh = is_checkpoint
+    envs.close()
+    if RANK:
+        return {}
+
+    # Test, once (Algorithm 2): the selected policy, frozen, with actions it has never met.
+    log.close()
+    return finish(folder, agent, phases, step, seconds)
+
+
+# ---- Algorithm 2: acting with new actions ----
+
+
+def evaluate(agent, phase, episodes, stream):
+    """The frozen policy with actions of a phase, (action_pool, K): means over `episodes` episodes.
+
+    Nothing is learned here; new actions only bring their rows of the table. Every episode has its
+    own K of them. Actions are drawn, as in training, not the likeliest taken [code]. `stream` names
+    the random numbers, see `seeds`. Returns score, its standard error over episodes (the paper's is
+    over 5 seeds, 8 in Grid World), return, length, episodes.
+    """
+    torch.manual_seed(seeds(1, *stream)[0])
+    # 40 environments [code]. [code] counts the first 5,000 episodes to end, which favours short
+    # ones; [here] each environment plays the same number.
+    N = min(episodes, 40)
+    to_play = np.full(N, episodes // N)
+    to_play[: episodes % N] += 1
+    envs, obs = make_envs(agent.args, phase, N, stream)
+    played = []
+    while to_play.any():
+        _, obs, infos = play_step(envs, obs, agent)
+        for episode in ended_episodes(infos, agent.args):
+            number = episode[0]
+            if to_play[number] > 0:
+                to_play[number] -= 1
+                played.append(episode)
+    envs.close()
+    stderr = np.std([score for _, score, *_ in played]) / math.sqrt(episodes)
+    score, total, length = episode_means(played)
+    means = {"score": score, "return": total, "length": length}
+    return dict(means, stderr=float(stderr), episodes=episodes)
+
+
+# ---- which actions are available, and what is known about them ----
+
+# Options that an environment's make_vec takes, by their names in Args.
+OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}
+# How the encoders of --representation differ from hvae.py's defaults.
+ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
+
+
+def seeds(n, *stream):
+    """`n` seeds of one stream of random numbers, independent of all other streams."""
+    # A stream is named by the run's seed and by what it is for: 1 training environments, 2 PyTorch,
+    # 3 evaluations while training, 4 the final test, 5 the command `evaluate`, 6 pictures.
+    return np.random.SeedSequence(stream).generate_state(n).tolist()
+
+
+def task_options(args):
+    """The options of this environment's make_vec."""
+    return {name: getattr(args, name) for name in OPTIONS.get(args.env, ())}
+
+
+def with_no_op(action_pool, args):
+    """The pool and CREATE's no-op (A.3), which is available in every episode [code]."""
+    no_op = getattr(hvae.load_environment(args.env), "NO_OP", None)
+    return action_pool if no_op is None else np.union1d(action_pool, [no_op])
+
+
+def make_envs(args, phase, num_envs, stream):
+    """Environments for a phase, (action_pool, K available), and their first observation."""
+    action_pool, K = phase
+    make_vec = hvae.load_environment(args.env).make_vec
+    envs = make_vec(num_envs, action_pool, K, list(stream), **task_options(args))
+    envs = RecordEpisodeStatistics(envs)
+    obs, _ = envs.reset()
+    if not np.isin(obs["available"], with_no_op(action_pool, args)).all():
+        raise UserError("a reset makes actions available that are not in its action_pool")
+    return envs, obs
+
+
+def action_phases(args):
+    """For each phase (action_pool, K); and all ids (n,) that can be available while training.
+
+    UserError if parts of the split overlap, or if a pool has fewer than K actions.
+    """
+    split = hvae.load_environment(args.env).split_actions(args.split, args.split_seed)
+    ids = np.concatenate([split["train"], split["valid"], split["test"]])
+    if len(np.unique(ids)) < len(ids):
+        raise UserError(f"parts of split {args.split!r} overlap: unseen actions would be seen")
+
+    # "learn": the policy is trained; "train": it is scored on the same actions; "valid": selects
+    # the checkpoint; "test": scored once, at the end. K random actions of the pool are available in
+    # an episode: num_available in "learn", eval_available elsewhere. Three cases learn with a fixed
+    # set instead, all of it available all the time, and "train" scores them on it: nearest
+    # neighbour (which has an output per action), the ablation without subsampling, and C.2.
+    action_pool = split["test"] if args.adapt else split["train"]
+    K = args.num_available
+    eval_K = args.eval_available or K
+    train_K = eval_K
+    if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
+        if args.fixed_set_size and args.method != "nearest-neighbor":
+            rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
+            size = min(args.fixed_set_size, len(action_pool))
+            action_pool = np.sort(rng.choice(action_pool, size, replace=False))
+        K = train_K = len(with_no_op(action_pool, args))
+    phases = {"learn": (action_pool, K), "train": (action_pool, train_K)}
+    if not args.adapt:
+        phases.update(valid=(split["valid"], eval_K), test=(split["test"], eval_K))
+    for phase, (pool, k) in phases.items():
+        if not 1 <= k <= len(with_no_op(pool, args)):
+            raise UserError(
+                f"{k} available actions: phase {phase!r} has {len(with_no_op(pool, args))}"
+            )
+    return phases, with_no_op(action_pool, args)
+
+
+def load_table(args):
+    """The representations (A, D); trains the encoder if its table is not there yet."""
+    if args.finetune:  # the policy goes on with the table it knows
+        return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
+    if args.representation.startswith("engineered"):
+        module = hvae.load_environment(args.env)
+        options = {}
+        if "-" in args.representation:
+            options["variant"] = args.representation.partition("-")[2]
+        if args.fully_observable:
+            options["fully_observable"] = True
+        table = module.engineered_representations(**options)
+        if len(table) != module.NUM_ACTIONS or not np.isfinite(table).all():
+            raise UserError(f"engineered_representations: not {module.NUM_ACTIONS} finite rows")
+        return table
+    path = Path(args.representation)
+    if path.suffix == ".npz":
+        return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
+
+    # The encoder learns from training actions only (but for "hvae-all"); then it encodes all of
+    # them. One table serves all seeds of the policy, as published: the encoder's seed stays 0.
+    encoder = hvae.default_args(args.env, args.hvae_recipe, args.modality)
+    changes = dict(split=args.split, split_seed=args.split_seed)
+    changes.update(runs_dir=args.runs_dir, device=args.device, **ENCODERS[args.representation])
+    encoder = replace(encoder, **changes)
+    path = hvae.representation_path(encoder)
+    if not path.exists():
+        print(f"no {path} yet: training the encoder first", flush=True)
+        hvae.train(encoder)
+    return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
+
+
+def start_from(agent, folder):
+    """C.2: take over the weights of a trained policy."""
+    theirs = load(folder / "best.pt")
+    for name in ("env", "method", "split", "split_seed"):
+        there = getattr(theirs["args"], name)
+        if there != getattr(agent.args, name):
+            raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
+    if agent.args.method == "nearest-neighbor":
+        # Its outputs are actions, so they start anew; [code] does so with the stop head, too.
+        own = agent.state_dict()
+        anew = [name for name in own if name.startswith(("head.", "fc_stop."))]
+        theirs["agent"].update({name: own[name] for name in anew})
+    put(theirs, folder, agent=agent)
+
+
+def choose_device(args):
+    """The device of --device; under torchrun, each process has a GPU of its own."""
+    if args.device == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+
+
+def check(args):
+    """UserError, before anything is written, for what cannot be trained."""
+    module = hvae.load_environment(args.env)
+    names = dict(split="SPLITS", task="TASKS", placement="PLACEMENTS")
+    for option, allowed in names.items():
+        value = getattr(args, option)
+        if value is not None and hasattr(module, allowed):
+            hvae.choose(option, value, getattr(module, allowed))
+    if not args.representation.endswith(".npz"):
+        variants = [f"engineered-{variant}" for variant in getattr(module, "VARIANTS", ())]
+        allowed = [*ENCODERS, "engineered", *variants, "FILE.npz"]
+        hvae.choose("representation", args.representation, allowed)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device cuda: PyTorch finds no GPU here")
+    # A rollout is cut into whole steps of all environments, and into equal shares of processes.
+    size = args.minibatch_size * args.num_minibatches
+    if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
+        processes = f"{WORLD_SIZE} processes, as minibatch_size"
+        raise UserError(f"num_envs {args.num_envs}: it must divide {size} and suit {processes}")
+    if not 2 <= size <= args.total_timesteps:
+        raise UserError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
+    action_phases(args)
+
+
+# ---- the run's folder ----
+
+FREE = ("runs_dir", "run_name", "resume", "device")  # these do not make another run
+TESTED = {"train": "seen", "valid": "validation", "test": "unseen"}  # phases and their titles
+PUBLISHED = {  # HVAE (recsys: engineered) + utility: seen, unseen (published_results.csv)
+    "gridworld": (0.904, 0.703),
+    "recsys": (0.322, 0.197),
+    "create": (0.907, 0.797),  # push
+    "stacking": (2.354, 1.716),
+}
+
+
+def run_name_of(args):
+    """<env>[-<option>-<value>]*-s<seed>, with the options that differ from the recipe."""
+    usual = vars(default_args(args.env, args.recipe, args.quick))
+    usual = dict(usual, recipe="fast", quick=False)
+    words = [hvae.environment_name(args.env)]
+    for name, value in vars(args).items():
+        if value != usual[name] and name not in ("seed", *FREE):
+            words.append(name if value is True else f"{name}-{value}")
+    # Only what every file system takes, and no more of it than it takes.
+    return re.sub("[^A-Za-z0-9._-]", "_", "-".join(words))[:120] + f"-s{args.seed}"
+
+
+def claim_folder(args):
+    """The run's folder, new or to be resumed; no other process may write there as long as we live.
+
+    UserError if another process does, if there is a checkpoint but no --resume, or if --resume
+    comes with other options than the run was started with.
+    """
+    name = args.run_name or run_name_of(args)
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,139}", name):
+        raise UserError(f"run_name {name!r}: at most 140 letters, digits and . _ - are allowed")
+    folder = Path(args.runs_dir) / name
+    folder.mkdir(parents=True, exist_ok=True)
+    # Two processes in one folder would mix their rows. A lock of the operating system ends with its
+    # process, however that ends.
+    lock = FileLock(folder / ".lock", is_singleton=True)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise UserError(f"{folder} is in use by another process") from None
+    atexit.register(lock.release)
+    path = folder / "checkpoint.pt"
+    if path.exists() and not args.resume:
+        raise UserError(f"{folder} exists: --resume goes on with it, --run-name keeps both")
+    if path.exists():
+        for name, there in vars(load(path)["args"]).items():
+            if there != getattr(args, name) and name not in FREE:
+                raise UserError(f"cannot resume {folder}: its {name} is {there!r}")
+    return folder
+
+
+def load(path):
+    """A checkpoint, its "args" as Args; UserError if it is missing, damaged or of other code."""
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)  # runs no code
+        checkpoint["args"] = Args(**checkpoint["args"])
+    except Exception as e:  # for damaged files torch has a dozen kinds of errors
+        reason = str(e).split("\n")[0]
+        hint = "the run's folder is expected"
+        raise UserError(f"{path} is no checkpoint of this script, {hint}: {reason}") from None
+    return checkpoint
+
+
+def put(checkpoint, path, **learned):
+    """Copy a checkpoint's states into agent, optimiser, ...; UserError names what does not fit."""
+    for name, part in learned.items():
+        try:
+            part.load_state_dict(checkpoint[name])
+        except RuntimeError as e:
+            reason = str(e).split("\n")[-1].strip()
+            raise UserError(f"{path} does not fit this script and its options: {reason}") from None
+
+
+class Log:
+    """A run's metrics.csv, TensorBoard events and progress bar."""
+
+    def __init__(self, args, folder, step, size):
+        from torch.utils.tensorboard import SummaryWriter  # here, because it takes 1.5 s
+
+        text = json.dumps(vars(args), indent=1)
+        hvae.write(folder / "args.json", lambda file: file.write(text.encode()))
+        self.file = open(folder / "metrics.csv", "a", encoding="utf-8", newline="")
+        self.file.truncate(size)  # rows after the checkpoint are made again
+        self.file.seek(size)
+        self.writer = SummaryWriter(folder, purge_step=step)
+        print(f"run: {folder}", flush=True)
+        steps = dict(total=args.total_timesteps, initial=step)
+        self.bar = tqdm(**steps, unit="step", unit_scale=True, disable=None)  # only on a terminal
+
+    def write(self, row):
+        """A row for one rollout, scores onto the screen; returns the size of metrics.csv."""
+        table = csv.DictWriter(self.file, row.keys(), lineterminator="\n")
+        if self.file.tell() == 0:
+            table.writeheader()
+        table.writerow(row)
+        self.file.flush()
+        for name, x in row.items():
+            if x is not None:
+                self.writer.add_scalar(name, x, row["step"])
+        self.bar.update(row["step"] - self.bar.n)
+        if row["train_score"] is not None:
+            scores = "seen {train_score:.3f}, validation {valid_score:.3f}".format(**row)
+            self.bar.set_postfix_str(scores)
+            self.bar.write(f"step {row['step']:,}: {scores}")
+        return self.file.tell()
+
+    def close(self):
+        self.bar.close()
+        self.file.close()
+        self.writer.close()
+
+
+def finish(folder, agent, phases, step, seconds):
+    """Test the best checkpoint; write results.json; then draw pictures and print the scores."""
+    args = agent.args
+    # Results are written first. Whatever goes wrong with a picture afterwards, they are safe.
+    best = load(folder / "best.pt")
+    put(best, folder, agent=agent)
+    metric = hvae.load_environment(args.env).METRIC
+    launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
+    words = [Path(sys.argv[0]).name, *sys.argv[1:]]
+    results = dict(metric=metric, seed=args.seed, command=f"{launcher} {shlex.join(words)}")
+    results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
+    titles = {"train": "adapted to"} if args.adapt else TESTED
+    for phase in titles:
+        results[phase] = evaluate(agent, phases[phase], args.eval_episodes, (args.seed, 4))
+    text = json.dumps(results, indent=1)
+    hvae.write(folder / "results.json", lambda file: file.write(text.encode()))
+    try:
+        plot_curve(folder, metric)
+        record_episode(agent, phases["train" if args.adapt else "test"], folder / "episode.gif")
+    except Exception as e:
+        print(f"note: a picture is missing: {type(e).__name__}: {e}")
+
+    print(f"\n{metric}, mean and standard error of {args.eval_episodes} episodes")
+    for phase, title in titles.items():
+        print("{:10} {score:7.3f} +- {stderr:.3f}".format(title, **results[phase]))
+    if args.env in PUBLISHED and args.task in (None, "push"):
+        print("the paper's main method: seen {}, unseen {}".format(*PUBLISHED[args.env]))
+    print(f"curve, episode, metrics and checkpoints: {folder}")
+    return results
+
+
+def plot_curve(folder, metric):
+    """C.7, Figure 14: scores over steps; not held at their maximum, as the published ones are."""
+    os.environ.pop("MPLBACKEND", None)  # one inherited from a notebook ends the import
+    from matplotlib.figure import Figure  # not pyplot, which looks for a display
+
+    rows = np.genfromtxt(folder / "metrics.csv", delimiter=",", names=True, encoding="utf-8")
+    rows = rows[~np.isnan(rows["train_score"])]
+    figure = Figure(figsize=(6, 4), layout="tight")
+    axes = figure.subplots()
+    for column in ("train_score", "valid_score"):
+        axes.plot(rows["step"] / 1e6, rows[column], marker=".", label=column)
+    axes.set(xlabel="million steps", ylabel=metric, ylim=(0, None))
+    axes.legend(frameon=False)
+    hvae.write(folder / "curve.png", lambda file: figure.savefig(file, format="png", dpi=120))
+
+
+def record_episode(agent, phase, path):
+    """Play one episode and save it as a GIF, in colour."""
+    envs, obs = make_envs(agent.args, phase, 1, (agent.args.seed, 6))
+    # Not to be reset at the end of the episode, or its last pictures would be lost.
+    envs.unwrapped.autoreset_mode = AutoresetMode.DISABLED
+    env = envs.unwrapped.envs[0].unwrapped
+    env.render_mode = "rgb_array"
+    obs, _ = envs.reset()
+    frames = env.render_frames()
+    done = False
+    while not done:
+        transition, obs, _ = play_step(envs, obs, agent)
+        done = bool(transition["done"])
+        frames += env.render_frames()
+    envs.close()
+    module = hvae.load_environment(agent.args.env)
+    module.save_gif(path, frames, fps=env.metadata["render_fps"])
+
+
+# ---- python ppo_actiongen.py evaluate RUN: other available actions, and the analyses of A.3 ----
+
+
+@dataclass
+class EvaluateArgs:
+    """Test the policy of a run with other available actions; also the analyses of A.3."""
+
+    run: tyro.conf.Positional[str]  # the run's folder
+    actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
+    num_available: int | None = None  # K; None: as in the run's own test
+    min_angle_gap: float | None = None  # CREATE: only tools at least this many degrees away
+    min_embedding_distance: float | None = None  # a share, .3: without the 30 % nearest to training
+    unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
+    episodes: int = 5000  # episodes to play
+    save: bool = False  # append the scores to evaluations.csv in the run's folder
+    gif: str | None = None  # record one episode in this file, NAME.gif
+
+
+def restrict_pool(options, module, table, pool, known):
+    """The pool (m,) of unseen ids for an analysis of A.3; `known` (n,) were trained on."""
+    analyses = (options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio)
+    if analyses == (None, None, None):
+        return pool
+    if np.isin(pool, known).any():
+        raise UserError("the analyses choose among unseen actions")
+    for share in analyses[1:]:
+        if share is not None and not 0 <= share <= 1:
+            raise UserError(f"{share} is no share between 0 and 1")
+    if options.min_embedding_distance is not None:
+        # Squared distance to the nearest representation of a training action. The published limits
+        # fit the scale of one encoder; a share of the pool means the same for all of them.
+        distances = torch.cdist(table[pool].double(), table[known].double())  # (m, n)
+        squared = distances.amin(1).square().numpy()
+        pool = pool[squared >= np.quantile(squared, options.min_embedding_distance)]
+    if options.min_angle_gap is not None:
+        # Only tools that differ by so much from every training tool's angle.
+        if not hasattr(module, "angle_gaps"):
+            raise UserError("min_angle_gap: only the tools of CREATE have angles")
+        pool = pool[module.angle_gaps(pool, known) >= options.min_angle_gap]
+    if options.unseen_ratio is not None:
+        # A mixture as large as the smaller side, whatever the share, so that only the share differs
+        # between two evaluations. The same mixture for all runs: seed 0.
+        rng = np.random.default_rng(0)
+        size = min(len(pool), len(known))
+        num_unseen = round(options.unseen_ratio * size)
+        unseen = rng.choice(pool, num_unseen, replace=False)
+        pool = np.union1d(unseen, rng.choice(known, size - num_unseen, replace=False))
+    return pool
+
+
+def evaluate_run(options):
+    """Score a run's best checkpoint, print it, and write what --save and --gif ask for."""
+    if options.gif and not options.gif.endswith(".gif"):
+        raise UserError(f"gif {options.gif}: the name has to end in .gif")
+    folder = Path(options.run)
+    best = load(folder / "best.pt")
+    args = best["args"]
+    table = best["agent"]["table"]
+    phases, train_ids = action_phases(args)
+    phase = "train" if args.adapt else options.actions
+    pool, K = phases[phase]
+    K = K if options.num_available is None else options.num_available
+    module = hvae.load_environment(args.env)
+    pool = restrict_pool(options, module, table, pool, phases["learn"][0])
+    most = len(with_no_op(pool, args))
+    if not 1 <= K <= most:
+        raise UserError(f"{K} available actions are asked for, but the pool has {most}")
+
+    # The policy as it was trained, but with other actions: that is all of Algorithm 2.
+    stream = (args.seed, 5)
+    envs, _ = make_envs(args, (pool, K), 1, stream)
+    agent = Agent(envs, table.numpy(), train_ids, args)
+    envs.close()
+    put(best, folder, agent=agent)
+    result = evaluate(agent, (pool, K), options.episodes, stream)
+    title = "adapted to" if args.adapt else options.actions
+    print(f"{title}: {K} of {most} actions available, {options.episodes} episodes")
+    print(module.METRIC + " {score:.4f} +- {stderr:.4f}".format(**result))
+
+    if options.save:
+        # `best_step` tells which checkpoint was scored: an unfinished run may still find a better.
+        row = dict(vars(options), num_available=K, pool_size=len(pool), **result)
+        row["best_step"] = best["step"]
+        with open(folder / "evaluations.csv", "a", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow(row)
+    if options.gif:
+        record_episode(agent, (pool, K), Path(options.gif))
+        print(f"episode: {options.gif}")
+    return result
+
+
+# ---- the command line ----
+
+
+def parse_args(words):
+    """Args of a command line."""
+    # Environment, recipe and quick decide all other defaults, so the line is read twice.
+    first = tyro.cli(Args, args=[word for word in words if word not in ("-h", "--help")])
+    default = default_args(first.env, first.recipe, first.quick)
+    args = tyro.cli(Args, args=words, default=default, description=__doc__)
+    return replace(args, env=default.env)  # an own file by its absolute path
+
+
+def main(words):
+    """Train what the command line says, or evaluate what was trained."""
+    torch.set_num_threads(1)  # for layers this small a second thread waits more than it works
+    if words[:1] == ["evaluate"]:
+        prog = "ppo_actiongen.py evaluate"
+        return evaluate_run(tyro.cli(EvaluateArgs, args=words[1:], prog=prog))
+    args = parse_args(words or ["--help"])
+    if WORLD_SIZE > 1:  # the others may wait for hours while rank 0 trains an encoder
+        dist.init_process_group("gloo", timeout=timedelta(days=3))
+        atexit.register(dist.destroy_process_group)
+    return train(args)
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UserError as e:  # a mistake of the user's; one of the program's keeps its traceback
+        raise SystemExit(f"error: {e}") from None
+    except OSError as e:
+        if e.errno not in (errno.ENOSPC, errno.EACCES):
+            raise
+        raise SystemExit(f"error: {e.strerror}: {e.filename or 'the run'}") from None
