@@ -7,11 +7,12 @@
 
 TABLE is the whole matrix: figure -> row -> command. A command's first word says what it is: an
 environment (a training), `evaluate` (a test of a finished training) or `hvae` (an encoder). {row}
-in a command is the folder of another row, {figure/row} that of another figure's; these come along.
-What is finished is not run again, what was killed goes on from its checkpoint, and rows of several
-figures that are the same run share it. Scores go to results/<figure>.csv, one row per run and
-phase, learning curves to results/<figure>_curves.csv; with --recipe paper to <figure>-paper.csv,
-since two recipes never share a table. benchmarks/report.py draws them.
+in a command is the folder, or the table, of another row, {figure/row} that of another figure's;
+these come along. What is finished is not run again, what was stopped goes on from its checkpoint,
+and rows of several figures that are the same run share it. Nothing starts from a command that
+failed. Scores go to results/<figure>.csv, one row per run and phase, learning curves to
+results/<figure>_curves.csv; with --recipe paper to <figure>-paper.csv, since two recipes never
+share a table. benchmarks/report.py draws them.
 """
 
 import csv
@@ -22,14 +23,13 @@ import platform
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
-from collections import defaultdict
-from concurrent.futures import ThreadPoolExecutor
+import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from threading import Lock
 from typing import Literal
 
 import tyro
@@ -37,10 +37,14 @@ import tyro
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 import hvae  # noqa: E402
-import ppo_actiongen  # noqa: E402
+import ppo_actiongen as ppo  # noqa: E402
+from hvae import UserError  # noqa: E402
 
-# Rows have the names of results/published_results.csv, so that ours and published scores join. They
-# hold their method's own flags and nothing else: --recipe paper is Tables 3 and 4 but for these.
+# ---- which commands make which row ----
+
+# Rows have the names of results/published_results.csv, in which "ours" is HVAE + utility, so that
+# measured and published scores join. They hold their method's own flags and nothing else: --recipe
+# paper is Tables 3 and 4 but for these.
 
 FIGURE_8 = {  # the baselines and ablations of the main paper
     "ours": "",
@@ -54,11 +58,12 @@ METHODS = FIGURE_8 | {"oracle_encoder_all_actions": "--representation hvae-all"}
 ENGINEERED = {"engineered": "--representation engineered"}
 VIDEO = {"ours_video": "--modality video"}
 ONE_HOT = {"ours_alternate_modality": "--modality onehot"}
-MORE_ENTROPY = {"ours_more_entropy": "--ent-coef 0.02"}  # beyond the paper: Table 3 has 0.005
+MORE_ENTROPY = {"ours_more_entropy": "--ent-coef 0.02"}  # [here]; Table 3 has 0.005
 FULL_SPLIT = {"ours_full_split": "--split full"}  # Tables 1 and 2
+LINEAR = {"ours_linear_path": "--linear-path"}  # [here] of encoders
 RECSYS = {  # A.2 gives the representations, so there is no encoder to compare
     "ours": "--no-bilinear --hidden-size 64",  # D.3.2's utility, Table 4's units
-    "ours_bilinear": "--bilinear",  # beyond the paper; the fast recipe's default
+    "ours_bilinear": "--bilinear",  # [here], and the fast recipe's default
     "ours_no_entropy": "--no-bilinear --hidden-size 64 --ent-coef 0",
     "ours_no_subsampling": "--no-bilinear --hidden-size 64 --no-subsample",
     "nearest_neighbor": "--method nearest-neighbor --hidden-size 64",
@@ -71,8 +76,9 @@ PLACEMENT = {"ours_no_place": "--placement none", "ours": "", "ours_2d_place": "
 # A.3: "HVAE was trained as an oracle encoder over the entire action set"; one policy for all.
 ANALYSIS = {"ours": "--split analysis --representation hvae-all"}
 TEST = "evaluate {analysis/TASK/ours} --num-available 50"  # K of Table 3
+RATIOS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 ENCODERS = {"ours": "", "non_hierarchical_vae": "--no-hierarchical"}
-CREATE = "push seesaw obstacle".split()  # in the main paper
+CREATE = ("push", "seesaw", "obstacle")  # in the main paper
 NINE = "navigate cannon ladder belt buckets basket collide moving funnel".split()  # C.1
 
 
@@ -98,43 +104,50 @@ TABLE = {
         "create/ours": "create --quick",
         "stacking/ours": "stacking --quick",
     },
-    "gridworld": rows("gridworld", METHODS | ENGINEERED | ONE_HOT),
+    "gridworld": rows("gridworld", METHODS | ENGINEERED | ONE_HOT)
+    | {"ours_linear_path": "gridworld --representation {fig4/ours_linear_path}"},
     "recsys": rows("recsys", RECSYS),
     "create-push": rows("create --task push", METHODS | VIDEO | MORE_ENTROPY),
     "create-seesaw": rows("create --task seesaw", METHODS | VIDEO | ENGINEERED | MORE_ENTROPY),
     "create-obstacle": rows("create --task obstacle", METHODS | VIDEO | MORE_ENTROPY),
-    "stacking": rows("stacking", METHODS | ENGINEERED),
-    "fig4": rows("hvae gridworld", ENCODERS | ONE_HOT),
+    "stacking": rows("stacking", METHODS | ENGINEERED)
+    | {"ours_linear_path": "stacking --representation {fig6/ours_linear_path}"},
+    "fig4": rows("hvae gridworld", ENCODERS | ONE_HOT | LINEAR),
     "fig5": rows("hvae create", ENCODERS | VIDEO | FULL_SPLIT),
-    "fig6": rows("hvae stacking", ENCODERS | FULL_SPLIT),
+    "fig6": rows("hvae stacking", ENCODERS | FULL_SPLIT | LINEAR),
     "fig8": rows("create --task TASK", FIGURE_8, NINE),
     "fig9": {},  # below
     "fig10": rows("create --task TASK", SUBGOAL, CREATE),
     "fig11": rows("create --task TASK", AUXILIARY, CREATE),
-    # C.5. Runs are tested with 500 products on offer (Table 3); published code: with 25.
+    # C.5. Runs are tested with 500 products available (Table 3); [code] with 25.
     "fig12": rows("recsys --fully-observable", RECSYS)
     | rows("evaluate {ours}", vary("num-available", 25)),
     "fig13": rows("stacking", PLACEMENT | FULL_SPLIT),  # C.6
     "table1": rows("create --task TASK", {"ours": ""} | FULL_SPLIT, CREATE),
     "analysis": rows("create --task TASK", ANALYSIS, CREATE),
     "analysis-angle": rows(TEST, vary("min-angle-gap", 15, 12, 9, 6, 3), CREATE),
-    # Published: squared distances 0.5 .. 5, which depend on the scale of one encoder's table. Ours:
-    # quantiles of the unseen tools' squared distance to the nearest training tool.
+    # Published: squared distances 0.5 .. 5, which depend on the scale of one encoder's table.
+    # [here] the share of unseen tools that are too near to a training tool: 0 .. 0.9.
     "analysis-embedding": rows(
-        TEST, vary("min-embedding-distance", *(f"q0.{q}" for q in range(10))), CREATE
-    ),  # published ratios: up to 0.8
-    "analysis-unseen-ratio": rows(TEST, vary("unseen-ratio", *(r / 5 for r in range(6))), CREATE),
+        TEST, vary("min-embedding-distance", *(f"0.{q}" for q in range(10))), CREATE
+    ),
+    # Published ratios: up to 0.8; and of unseen tools only those above a distance of 3, the sixth
+    # of the ten distances above.
+    "analysis-unseen-ratio": rows(
+        f"{TEST} --min-embedding-distance 0.5", vary("unseen-ratio", *RATIOS), CREATE
+    ),
     "analysis-set-size": {},  # below
 }
 for method in ("ours", "ours_no_entropy", "ours_no_subsampling"):
-    start = f"evaluate {{create-TASK/{method}}} --episodes 1000"  # published code: 1,000
-    tests = rows(start, vary("num-available", *range(10, 61, 5)), ("push", "seesaw"))
+    test = f"evaluate {{create-TASK/{method}}} --episodes 1000"  # [code]
+    tests = rows(test, vary("num-available", *range(10, 61, 5)), ("push", "seesaw"))
     TABLE["analysis-set-size"] |= {f"{method}/{row}": command for row, command in tests.items()}
-# C.2. Zero-shot is tested as the others learn: with all unseen actions on offer at once. Published
-# code: 500 products in the Recommender's zero-shot test; we take the 2,000 that ours adapts to.
+# C.2. Zero-shot is tested as the others learn: with all unseen actions available at once. [code]
+# 500 products in the Recommender's zero-shot test; [here] the 2,000 that its policies adapt to.
 WHOLE = {"create-obstacle": 507, "create-seesaw": 507, "stacking": 203, "gridworld": 256}
 for name, size in (WHOLE | {"recsys": 2000}).items():
-    ours, discrete = TABLE[name]["ours"], TABLE[name]["nearest_neighbor"]
+    ours = TABLE[name]["ours"]
+    discrete = TABLE[name]["nearest_neighbor"]
     TABLE["fig9"] |= {
         f"{name}/zero-shot": f"evaluate {{{name}/ours}} --num-available {size}",
         f"{name}/ours_from_scratch": f"{ours} --adapt",
@@ -169,7 +182,7 @@ class Job:
     seed: int
     kind: str  # train, evaluate or hvae
     words: list[str]  # of its command line
-    args: ppo_actiongen.Args | ppo_actiongen.EvaluateArgs | hvae.Args  # as the script reads them
+    args: ppo.Args | ppo.EvaluateArgs | hvae.Args  # as the script reads them
     folder: Path  # of the run; of an encoder: its table
     needs: "list[Job]"  # what it starts from
 
@@ -179,54 +192,57 @@ class Job:
         return f"python {script} {shlex.join(self.words)}"
 
 
-def parse(words: list[str]) -> ppo_actiongen.Args:
-    """The options of a training, as the script reads them: the first three decide the defaults."""
-    first = tyro.cli(ppo_actiongen.Args, args=words)
-    default = ppo_actiongen.default_args(first.env, first.recipe, first.quick)
-    return tyro.cli(ppo_actiongen.Args, args=words, default=default)
-
-
 @cache  # what several rows need is one job
 def expand(figure: str, row: str, seed: int, args: Args) -> Job:
     """The job of one row and seed."""
-    (kind, *words), needs = shlex.split(TABLE[figure][row]), []
+    kind, *words = shlex.split(TABLE[figure][row])
+    needs = []
     for i, word in enumerate(words):
         if word.startswith("{"):
             name = word.strip("{}")
             where = (figure, name) if name in TABLE[figure] else name.split("/", 1)
             needs.append(expand(*where, seed, args))
-            words[i] = str(needs[-1].folder)
+            words[i] = needs[-1].folder.as_posix()
     if kind == "evaluate":
+        test = tyro.cli(ppo.EvaluateArgs, args=[*words, "--save"])
         words = ["evaluate", *words, "--save"]
-        test = tyro.cli(ppo_actiongen.EvaluateArgs, args=words[1:])
         return Job(figure, row, seed, kind, words, test, needs[0].folder, needs)
-    words = words if kind == "hvae" else [kind, *words, "--seed", str(seed)]
-    # Ours: where the split is random, every seed has its own, so that the spread over seeds holds
-    # the luck of the split. CREATE and Stacking: one split for all seeds, as published.
-    words += ["--split-seed", str(seed)] if words[0] in ("gridworld", "recsys") else []
-    words += ["--recipe", "paper"] if args.recipe == "paper" else []
-    words += ["--runs-dir", args.runs_dir] if args.runs_dir != "runs" else []
-    if kind == "hvae":  # one encoder seed for all policies, as published
+
+    if kind != "hvae":  # one encoder seed for all policies, as published
+        words = [kind, *words, "--seed", str(seed)]
+    if words[0] in ("gridworld", "recsys"):
+        # [here] Where the split is random, every seed has its own, so that the spread over seeds
+        # holds the luck of the split. CREATE and Stacking: one split for all seeds, as published.
+        words += ["--split-seed", str(seed)]
+    if args.recipe == "paper":
+        words += ["--recipe", "paper"]
+    if args.runs_dir != "runs":
+        words += ["--runs-dir", args.runs_dir]
+    if kind == "hvae":
         encoder = hvae.parse_args(words)
-        path = hvae.representation_path(encoder)
-        return Job(figure, row, seed, kind, words, encoder, path, needs)
+        table = hvae.representation_path(encoder)
+        return Job(figure, row, seed, kind, words, encoder, table, needs)
+
     if args.budget != 1:
-        usual = parse(words).total_timesteps
+        usual = ppo.parse_args(words).total_timesteps
         words += ["--total-timesteps", str(round(args.budget * usual))]
     words += shlex.split(args.extra)
-    training = parse(words)
-    path = ppo_actiongen.run_path(training)
-    return Job(figure, row, seed, "train", words, training, path, needs)
+    training = ppo.parse_args(words)
+    folder = Path(training.runs_dir) / (training.run_name or ppo.run_name_of(training))
+    return Job(figure, row, seed, "train", words, training, folder, needs)
 
 
 def plan(args: Args) -> list[Job]:
-    """The jobs of these figures, each after what it needs; ValueError for an unknown name."""
-    figures = tuple(TABLE) if args.figures == ("all",) else args.figures
-    if unknown := set(figures) - set(TABLE):
-        raise ValueError(f"figure {min(unknown)!r} is not one of {', '.join(TABLE)}, all")
-    named = {word for figure in figures for row in TABLE[figure] for word in (row, *row.split("/"))}
-    if unknown := set(args.only) - named:
-        raise ValueError(f"no row is called {min(unknown)}: see --dry-run")
+    """The jobs of these figures, each after what it needs; UserError for what cannot be meant."""
+    for figure in args.figures or [""]:
+        hvae.choose("figure", figure, [*TABLE, "all"])
+    figures = tuple(TABLE) if "all" in args.figures else args.figures
+    known = {word for figure in figures for row in TABLE[figure] for word in (row, *row.split("/"))}
+    for name in args.only:
+        hvae.choose("row", name, sorted(known))
+    if not args.seeds or args.budget <= 0 or args.jobs < 1:
+        raise UserError("at least one seed, a budget above 0 and one job are needed")
+
     jobs: dict[tuple, Job] = {}
 
     def add(job: Job) -> None:
@@ -242,116 +258,197 @@ def plan(args: Args) -> list[Job]:
     return list(jobs.values())
 
 
-COLUMNS = "env task method seed split split_seed recipe steps phase".split()  # a row's key
-COLUMNS += "score stderr episodes pool_size hours machine command".split()
-CURVES = "env task method seed recipe steps step train_score valid_score episode_score".split()
+# ---- what a finished command has left behind ----
+
+KEY = "env task method seed split split_seed recipe steps phase".split()
+COLUMNS = KEY + "score stderr episodes pool_size hours machine command".split()
+CURVE_KEY = "env task method seed recipe steps step".split()
+CURVES = CURVE_KEY + "train_score valid_score episode_score".split()
+# What a test is asked; its answers in evaluations.csv say the same in these columns.
+QUESTION = "actions num_available min_angle_gap min_embedding_distance unseen_ratio episodes"
 
 
 def read(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV file, [] if there is none."""
-    return list(csv.DictReader(path.open())) if path.exists() else []
+    if not path.exists():
+        return []
+    with open(path, encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 @cache
 def machine() -> str:
-    """Processor and threads of a job: hours mean little without them."""
+    """The processor: hours mean little without it. All scripts use one thread."""
     cpu = Path("/proc/cpuinfo")  # Linux
-    found = re.search(r"model name\s*: (.+)", cpu.read_text()) if cpu.exists() else None
-    name = found[1] if found else platform.processor()
-    return f"{name}, {os.environ.get('OMP_NUM_THREADS', 1)} thread(s)"  # 1: as the scripts do
+    text = cpu.read_text(encoding="utf-8") if cpu.exists() else ""
+    found = re.search(r"model name\s*: (.+)", text)
+    return f"{found[1] if found else platform.processor()}, 1 thread(s)"
+
+
+def results_of(job: Job) -> dict | None:
+    """results.json of a training, None if it is not finished.
+
+    UserError if the folder holds another command's run: its scores are not this row's.
+    """
+    path = job.folder / "results.json"
+    if not path.exists():
+        return None
+    made = json.loads((job.folder / "args.json").read_text("utf-8"))
+    for name, wanted in vars(job.args).items():
+        if name not in ppo.FREE and made.get(name, "missing") != wanted:
+            raise UserError(f"{job.folder} holds a run with another {name}: move it away")
+    return json.loads(path.read_text("utf-8"))
+
+
+def as_text(value) -> str:
+    """A value in a CSV file."""
+    return "" if value is None else str(value)
+
+
+def answers_of(job: Job, trained: dict) -> list[dict]:
+    """The rows of evaluations.csv with this question for the checkpoint that the run has now."""
+    wanted = {name: as_text(getattr(job.args, name)) for name in QUESTION.split()}
+    wanted["best_step"] = as_text(trained["best_step"])
+    return [row for row in read(job.folder / "evaluations.csv") if wanted.items() <= row.items()]
 
 
 def score_rows(job: Job) -> list[dict]:
-    """The rows of results/<figure>.csv for one job, [] if it is not finished.
+    """The rows of results/<figure>.csv for one job, [] if it is not finished."""
+    run = job.needs[0] if job.kind == "evaluate" else job
+    row = {name: getattr(run.args, name) for name in ("env", "split", "split_seed", "recipe")}
+    row.update(task=getattr(run.args, "task", ""), method=run.row.split("/")[-1])
+    row.update(seed=job.seed, machine=machine(), command=job.command)
+    if getattr(run.args, "fully_observable", False):
+        row["env"] = "recsys_full"
+    if row["method"] == "ours" and getattr(run.args, "aux_conditioned", False):
+        row["method"] = "ours_conditioned_auxiliary"  # C.4: with CREATE's fast recipe, too
 
-    Raises ValueError if the folder holds another command's run: its scores are not this row's.
-    """
-    run, wanted = job.needs[0] if job.kind == "evaluate" else job, vars(job.args)
-    row = {key: getattr(run.args, key) for key in ("env", "split", "split_seed", "recipe")}
-    row["env"] += "_full" * getattr(run.args, "fully_observable", False)
-    row |= {"task": getattr(run.args, "task", ""), "method": run.row.split("/")[-1]}
-    row |= {"seed": job.seed, "machine": machine(), "command": job.command}
     if job.kind == "hvae":
         path = job.folder.with_suffix(".json")
-        record = json.loads(path.read_text()) if path.exists() else defaultdict(dict)
-        scores = {f"{k}, published": v for k, v in record["published"].items()} | record["scores"]
-        found = [row | {"phase": k, "score": float(v)} for k, v in scores.items()]
-        if row["split"] == "default":  # the yardstick: the same scores of the ground truth
-            row["method"] = "engineered"
-            true = [row | {"phase": k, "score": float(v)} for k, v in record["engineered"].items()]
-            found = true + found
-        return found
+        if not path.exists():
+            return []
+        scores = json.loads(path.read_text("utf-8"))
+        return [row | {"phase": name, "score": score} for name, score in scores.items()]
+
+    trained = results_of(run)
+    if trained is None:
+        return []
+    row["steps"] = trained["steps"]
     if job.kind == "evaluate":
-        for found in read(job.folder / "evaluations.csv"):
-            same = {k: "" if v is None else str(v) for k, v in wanted.items() if k in found}
-            if same == {k: found[k] for k in same} and (trained := score_rows(run)):
-                row |= {"phase": job.row.split("/")[-1], "steps": trained[0]["steps"]}
-                return [row | {k: float(found[k]) for k in COLUMNS[9:13]}]
-        return []
-    if not (job.folder / "results.json").exists():
-        return []
-    made = json.loads((job.folder / "args.json").read_text())
-    for name in wanted.keys() - {"resume", "device", "runs_dir", "run_name"}:
-        if made.get(name, "missing") != wanted[name]:
-            raise ValueError(f"{job.folder} holds a run with another {name}: move it away")
-    found = json.loads((job.folder / "results.json").read_text())
-    row |= {"steps": found["steps"], "hours": found["hours"]}
+        row["phase"] = job.row.split("/")[-1]
+        for found in answers_of(job, trained):  # the last one counts
+            row.update({x: float(found[x]) for x in ("score", "stderr", "episodes", "pool_size")})
+        return [row] if "score" in row else []
+    row["hours"] = trained["hours"]
     # A policy that adapts has one set of actions, and one phase.
-    return [row | found[p] | {"phase": p} for p in ("train", "valid", "test") if p in found]
+    phases = [phase for phase in ("train", "valid", "test") if phase in trained]
+    return [row | trained[phase] | {"phase": phase} for phase in phases]
 
 
 def curve_rows(job: Job) -> list[dict]:
-    """A training's learning curve: at most 50 points, raw (published ones keep their maximum)."""
+    """A training's learning curve: at most 50 points, not held at their maximum."""
     # A policy that adapts is trained on what it is tested on: its own episodes are the curve.
-    names = CURVES[-1:] if job.args.adapt else CURVES[-3:-1]
+    names = ["episode_score"] if job.args.adapt else ["train_score", "valid_score"]
     points = [point for point in read(job.folder / "metrics.csv") if point[names[0]]]
-    points = points[:: -(len(points) // 50 + 1)][::-1]  # with the last one
-    same = {k: v for k, v in score_rows(job)[0].items() if k in CURVES}
-    return [same | {name: point[name] for name in ("step", *names)} for point in points]
+    every = len(points) // 50 + 1
+    points = points[::-every][::-1]  # with the last one
+    row = {name: value for name, value in score_rows(job)[0].items() if name in CURVES}
+    return [row | {name: point[name] for name in ("step", *names)} for point in points]
 
 
 def merge(path: Path, columns: list[str], key: list[str], rows: list[dict]) -> None:
     """Put rows into a CSV file, in the place of those of the same key; never half a file."""
-    if (old := read(path)) and [*old[0]] != columns:
-        raise ValueError(f"{path} has other columns: move it away")
-    table = {tuple(row[k] for k in key): row for row in old}
-    for row in rows:
-        row = {c: "" if row.get(c) is None else row[c] for c in columns}
-        row = {c: f"{v:.6g}" if isinstance(v, float) else str(v) for c, v in row.items()}
-        table[tuple(row[k] for k in key)] = row
+    old = read(path)
+    if old and list(old[0]) != columns:
+        raise UserError(f"{path} has other columns: move it away")
+    table = {}
+    for row in [*old, *rows]:
+        short = {k: f"{x:.6g}" if isinstance(x, float) else x for k, x in row.items()}
+        line = {column: as_text(short.get(column)) for column in columns}
+        table[tuple(line[column] for column in key)] = line
+
+    def by_size(item):  # 9 before 10
+        return [part.zfill(9) if part.isdigit() else part for part in item[0]]
+
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
-    order = sorted(table, key=lambda k: [part.zfill(9) * part.isdigit() or part for part in k])
-    writer.writerows(table[k] for k in order)  # numbers by size
-    hvae.write(path, lambda file: file.write(text.getvalue().encode()))
+    writer.writerows(line for _, line in sorted(table.items(), key=by_size))
+    hvae.write(path, lambda file: file.write(text.getvalue().encode("utf-8")))
 
 
-LOCK = Lock()  # one at a time writes tables
+# ---- running what is missing ----
 
 
-def run(job: Job, args: Args) -> bool:
-    """Run a job unless it is finished, and write its scores; whether there are any."""
-    log = Path(f"{job.folder}.log")
-    if not score_rows(job):
-        begun = job.kind == "train" and (job.folder / "args.json").exists()
-        words = shlex.split(job.command)[1:] + ["--resume"] * begun
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("a") as file:
-            subprocess.run([sys.executable, *words], stdout=file, stderr=file)
-    if not (found := score_rows(job)):
-        print(f"  FAILED  {job.command}  (see {log})", flush=True)
+def start(job: Job) -> subprocess.Popen:
+    """Start a job's command; a training goes on if it has a checkpoint."""
+    words = shlex.split(job.command)[1:]
+    if job.kind == "train" and (job.folder / "checkpoint.pt").exists():
+        words.append("--resume")
+    job.folder.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{job.folder}.log", "ab") as log:
+        # A process group of its own (not on Windows), so that all of it can be stopped.
+        output = dict(stdout=log, stderr=log, process_group=0)
+        return subprocess.Popen([sys.executable, *words], **output)
+
+
+def record(job: Job, args: Args) -> bool:
+    """Write a job's scores into the tables; whether there are any."""
+    found = score_rows(job)
+    if not found:
+        print(f"  FAILED  {job.command}  (see {job.folder}.log)", flush=True)
         return False
-    with LOCK:
-        name = job.figure + "-paper" * (args.recipe == "paper")
-        merge(Path(args.results_dir) / f"{name}.csv", COLUMNS, COLUMNS[:9], found)
-        if (tsne := job.folder.with_name(f"{job.folder.stem}-tsne.png")).exists():
-            shutil.copy(tsne, Path(args.results_dir) / f"{name}-tsne-{job.row}.png")
-        if job.kind == "train":
-            path = Path(args.results_dir) / f"{name}_curves.csv"
-            merge(path, CURVES, CURVES[:7], curve_rows(job))
-        print(f"{found[-1]['score']:8.3f}  {job.command}", flush=True)
+    name = job.figure + ("-paper" if args.recipe == "paper" else "")
+    results = Path(args.results_dir)
+    merge(results / f"{name}.csv", COLUMNS, KEY, found)
+    picture = job.folder.with_name(f"{job.folder.stem}-tsne.png")
+    if job.kind == "hvae" and picture.exists():
+        shutil.copy(picture, results / f"{name}-tsne-{job.row}.png")
+    if job.kind == "train":
+        merge(results / f"{name}_curves.csv", CURVES, CURVE_KEY, curve_rows(job))
+    print(f"{found[-1]['score']:8.3f}  {job.command}", flush=True)
     return True
+
+
+def run_all(jobs: list[Job], args: Args) -> int:
+    """Run what has no result, `args.jobs` at a time; the number of jobs without a result."""
+    waiting = list(jobs)
+    running: dict[subprocess.Popen, Job] = {}
+    succeeded: dict[str, bool] = {}  # by command: jobs of several figures may share one
+    failures = 0
+    try:
+        while waiting or running:
+            for process, job in list(running.items()):
+                if process.poll() is not None:
+                    del running[process]
+                    succeeded[job.command] = record(job, args)
+                    failures += not succeeded[job.command]
+            for job in list(waiting):
+                needed = [succeeded.get(need.command) for need in job.needs]
+                busy = [other.folder for other in running.values()]
+                if len(running) == args.jobs:
+                    break
+                if None in needed or job.folder in busy:  # one process in a folder
+                    continue
+                waiting.remove(job)
+                if False in needed or succeeded.get(job.command) is False:
+                    print(f"  SKIPPED {job.command}", flush=True)
+                    succeeded[job.command] = False
+                    failures += 1
+                elif score_rows(job):
+                    succeeded[job.command] = record(job, args)
+                else:
+                    running[start(job)] = job
+            time.sleep(0.2)
+    finally:  # Ctrl-C, SIGTERM, or an error of ours: nothing goes on without us
+        for process in running:
+            if process.poll() is None:  # as Ctrl-C would, so that it tidies up
+                process.terminate() if os.name == "nt" else os.killpg(process.pid, signal.SIGINT)
+            try:
+                process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+    return failures
 
 
 def main(args: Args) -> None:
@@ -363,21 +460,16 @@ def main(args: Args) -> None:
         return
     left = sum(not score_rows(job) for job in jobs)  # a folder of another run is an error now
     print(f"{left} of {len(jobs)} commands to run", flush=True)
-    chains = defaultdict(list)  # one after the other: a training, all that starts from it
-    for job in jobs:
-        first = job
-        while first.needs:
-            first = first.needs[0]
-        chains[first.folder].append(job)
-    with ThreadPoolExecutor(args.jobs) as pool:
-        done = pool.map(lambda chain: [run(job, args) for job in chain], chains.values())
-        failed = sum(chain.count(False) for chain in done)
-    if failed:
-        raise SystemExit(f"error: {failed} of {len(jobs)} commands failed")
+    failures = run_all(jobs, args)
+    if failures:
+        raise SystemExit(f"error: {failures} of {len(jobs)} commands have no result")
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     try:
         main(tyro.cli(Args))
-    except (ValueError, OSError) as e:
+    except UserError as e:
         raise SystemExit(f"error: {e}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("stopped: the same command goes on") from None
