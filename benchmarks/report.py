@@ -80,8 +80,8 @@ for file, key in (("results", "env task method phase"), ("analyses", "analysis t
     for row in read(RESULTS / f"published_{file}.csv"):
         numbers = (float(row["mean"]), float(row["std"]))
         PUBLISHED[tuple(row[name] for name in key.split())] = numbers
-matplotlib.rcParams |= {"font.size": 8, "axes.titlesize": 8.5, "axes.titlelocation": "left"}
-matplotlib.rcParams |= {"axes.spines.top": False, "axes.spines.right": False}
+LOOK = {"font.size": 8, "axes.titlesize": 8.5, "axes.titlelocation": "left"}
+LOOK |= {"axes.spines.top": False, "axes.spines.right": False}
 
 Place = tuple[str, str, int]  # env, task ("" without one), number of steps
 Cells = dict[tuple[Place, str], dict[str, list[float]]]  # place, method -> phase -> its seeds
@@ -347,7 +347,8 @@ def main(check: bool = False) -> None:
     """
     figures = [name for name in TABLE if name != "analysis"]  # no result of its own
     names = ["main", *figures, *(f"{name}-paper" for name in figures), "fig14"]
-    contents = {name: section(name, not check) for name in names}
+    with matplotlib.rc_context(LOOK):  # for these pictures only
+        contents = {name: section(name, not check) for name in names}
     for page, folder in ((RESULTS / "README.md", ""), (RESULTS.parent / "README.md", "results/")):
         text = page.read_text(encoding="utf-8") if page.exists() else ""
         new = text
