@@ -57,6 +57,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
+import gymnasium as gym
 import numpy as np
 import torch
 import torch.distributed as dist
@@ -64,7 +65,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 import tyro
 from filelock import FileLock, Timeout
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch.distributions import Beta, Categorical, Distribution, Normal
 from tqdm import tqdm
@@ -898,7 +899,7 @@ ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchic
 def seeds(n, *stream):
     """`n` seeds of one stream of random numbers, independent of all other streams."""
     # A stream is named by the run's seed and by what it is for: 1 training environments, 2 PyTorch,
-    # 3 evaluations while training, 4 the final test, 5 the command `evaluate`, 6 pictures.
+    # 3 evaluations while training, 4 the final test, 5 the command `evaluate`.
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -1202,12 +1203,14 @@ def plot_curve(folder, metric):
 
 def record_episode(agent, phase, path):
     """Play one episode and save it as a GIF, in colour."""
-    envs, obs = make_envs(agent.args, phase, 1, (agent.args.seed, 6))
-    # Not to be reset at the end of the episode, or its last pictures would be lost.
-    envs.unwrapped.autoreset_mode = AutoresetMode.DISABLED
-    env = envs.unwrapped.envs[0].unwrapped
-    env.render_mode = "rgb_array"
-    obs, _ = envs.reset()
+    # The environment's class is the one that its file defines. It stands alone, in this process,
+    # and is not reset at the end of the episode, or its last pictures would be lost.
+    module = hvae.load_environment(agent.args.env)
+    classes = [x for x in vars(module).values() if isinstance(x, type) and issubclass(x, gym.Env)]
+    own = [x for x in classes if x.__module__ == module.__name__]
+    env = own[0](*phase, render_mode="rgb_array", **task_options(agent.args))
+    envs = SyncVectorEnv([lambda: env], autoreset_mode=AutoresetMode.DISABLED)
+    obs, _ = envs.reset(seed=agent.args.seed)
     frames = env.render_frames()
     done = False
     while not done:
@@ -1215,7 +1218,6 @@ def record_episode(agent, phase, path):
         done = bool(transition["done"])
         frames += env.render_frames()
     envs.close()
-    module = hvae.load_environment(agent.args.env)
     module.save_gif(path, frames, fps=env.metadata["render_fps"])
 
 

@@ -44,13 +44,15 @@ def test_every_script_picture_and_heading_they_link_to_exists():
                 assert not anchor or anchor in anchors(PAGES[target]), f"{page}: #{anchor}"
 
 
-def test_tables_equal_the_csv_files_and_the_policies_play():
+def test_tables_equal_the_csv_files_and_the_policies_play(tmp_path):
     odd = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "cp1252"}
     report = [sys.executable, "benchmarks/report.py", "--check"]
     subprocess.run(report, cwd=ROOT, env={**os.environ, **odd}, check=True)
     for folder in (ROOT / "results" / "policies").iterdir():
-        options = ppo_actiongen.EvaluateArgs(str(folder), episodes=2)
+        gif = tmp_path / f"{folder.name}.gif"
+        options = ppo_actiongen.EvaluateArgs(str(folder), episodes=2, gif=str(gif))
         assert ppo_actiongen.evaluate_run(options)["episodes"] == 2
+        assert gif.read_bytes()[:3] == b"GIF"
 
 
 def test_every_figure_and_flag_it_names_is_known():
