@@ -352,13 +352,13 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         drawn.update(solids)
     train = np.array([shape.solid() in train_solids for shape in SHAPES])
 
-    # Full Split (Table 2): the class alone decides. So one solid is on both sides: a `hat` is a
-    # `triangle` that lies on another face.
+    # Full Split (Table 2): the class alone decides, in place of the draw. So one solid is on both
+    # sides: a `hat` is a `triangle` that lies on another face.
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
-    # A.4: "randomly splitting the test set into half". Copies of one solid at one angle stay
-    # together, so that no test shape looks like a validation shape.
+    # A.4: "randomly splitting the test set into half". Exact copies (one solid at one angle) stay
+    # together; other angles of a solid may be on both sides.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
     for shape_id in unseen:
@@ -625,7 +625,8 @@ class StackingEnv(gym.Env):
         if self._over:
             raise ResetNeeded("the episode is over (or none began): call reset()")
 
-        # Read the action, and refuse what is outside of the action space before anything moves.
+        # Read the action. A wrong choice, stop, or shape of position is an error, before anything
+        # moves; a place beyond [-1, 1] is not: it only uses up the step (below).
         choice = operator.index(action["choice"])
         stop = operator.index(action["stop"])
         position = np.asarray(action.get("position", ()), dtype=float)  # (d,)
@@ -637,7 +638,8 @@ class StackingEnv(gym.Env):
         self._frames = []
 
         # A.4: "If a shape has already been placed, trying to place it again does nothing." The two
-        # cylinders do not count. [here] Nor does a place beyond [-1, 1] do anything.
+        # cylinders do not count. [here] Nor does a place beyond [-1, 1], which an unclipped
+        # Gaussian policy may ask for, do anything.
         shape_id = self.available[choice]
         placed = shape_id in self.shape_ids[2:]
         inside = (np.abs(position) <= 1).all()
@@ -649,8 +651,9 @@ class StackingEnv(gym.Env):
         if drops:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
-            x, y = [*position, 0.0, 0.0][:2]
-            self._drop(shape_id, x, y, self.top(), COLOURS[shape_id])
+            place = np.zeros(2)  # x, y
+            place[: len(position)] = position
+            self._drop(shape_id, *place.tolist(), self.top(), COLOURS[shape_id])
             self._settle()
 
         # The episode ends where the agent says so, and after ten actions.
@@ -897,7 +900,7 @@ def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, li
         places = rng.uniform(-1, 1, (MAX_STEPS, 1))
     info = {}
     frames = env.render_frames()
-    for choice, place in zip(choices, places, strict=True):
+    for choice, place in zip(choices, places, strict=False):  # fewer than ten may be available
         *_, info = env.step({"choice": choice, "position": place, "stop": 0})
         frames += env.render_frames()
     return info[METRIC], frames
