@@ -1009,10 +1009,9 @@ class CreateEnv(gym.Env):
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a tool that is refused.
-    In tasks with a marker (blue), the marker must first push the target (red). The first time the
-    target is more than 3.56 units from its start is the target hit: +1 (obstacle: +2). In obstacle
-    and cannon it counts only after the marker has touched the target. The goal counts only in the
-    action of the hit or later.
+    In tasks with a marker (blue) the goal counts only at the target hit or later. That
+    is the first time the target (red) is more than 3.56 units from its start, whatever moved it: +1
+    (obstacle: +2). In obstacle and cannon the marker must also have touched it.
 
     ## Starting State
     The task's level with its random shifts; everything at rest.
