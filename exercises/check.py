@@ -6,9 +6,9 @@
     python exercises/check.py 9 alice bob          # folders that hold both scripts (exercise 9)
     python exercises/check.py same alice.py        # new options off: the same run, bit for bit?
 
-README.md has the exercises; there are checks for 2, 3, 5, 6, 7, 8 and 9. A check looks only at what
-the scripts do: it calls functions as the scripts given out call them, and options by the names that
-the exercise states. It compares with the policy script as it was given out, exercises/reference/.
+README.md has the exercises; all but 10 have a check. A check looks only at what the scripts do: it
+calls functions as the scripts given out call them, and options by the names that the exercise
+states. It compares with the policy script as it was given out, exercises/reference/.
 """
 
 import contextlib
@@ -44,7 +44,8 @@ def load(name, path):
 
 sys.path.insert(0, str(ROOT))
 reference = load("reference", ROOT / "exercises/reference/ppo_actiongen.py")
-load_environment = reference.hvae.load_environment  # Grid World as it was handed in
+hvae = reference.hvae
+load_environment = hvae.load_environment  # Grid World as it was handed in
 
 
 # ---- what the checks share ----
@@ -162,6 +163,22 @@ def train(ppo, **options):
 # ---- the checks ----
 
 
+def check_01(order):
+    agent, _, _, state, available = make(reference)
+    seen = float(order.largest_change(agent, state, available))
+    expect(0 <= seen < 1e-4, "logits that change by rounding alone", f"a change of {seen:.2g}")
+
+    def by_place(code, available):  # in the last state the first place is the best, whose ever
+        logits = torch.zeros(available.shape)
+        logits[-1] = torch.arange(K, 0, -1)
+        return logits
+
+    agent.utility = by_place
+    seen = float(order.largest_change(agent, state, available))
+    expected = "a change where the logits go by the place (here: of the last state's actions)"
+    expect(seen >= 1, expected, f"a change of {seen:.2g}")
+
+
 def check_02(ppo):
     need_change(ppo)
     H = 64
@@ -194,6 +211,18 @@ def check_03(_):
     expect(short == [0.1, 0, 0.024], "rewards 0.1, 0, 0.024 for 12 moves to the goal", short)
     longer = play("LLLLL RRRRR RDDDD DDLLL")
     expect(longer == [0, 0.1, 0, 0.034], "0.034 at the goal after five moves more", longer)
+
+
+def check_04(path):
+    gridworld = load_environment("gridworld")
+    table = hvae.load_representation(path, "gridworld")["mean"]
+    expect(table.shape == (1024, 2), "two numbers for each of 1,024 skills", table.shape)
+    split = gridworld.split_actions()
+    scores = hvae.probe(table, split["train"], np.union1d(split["valid"], split["test"]))
+    expected = "net_r2 above 0.99 (are differences of uint8 taken as such? 3 - 5 makes 254)"
+    expect(scores["net_r2"] > 0.99, expected, scores["net_r2"])
+    whole = (table == table.round()).all()
+    expect(not whole, "means of recordings, in which walls stop some moves", "whole numbers")
 
 
 def check_05(ppo):
@@ -323,8 +352,68 @@ def check_09(ppo):
             expect(truncated == (choice == 1), "truncated when nothing is left, not before", "no")
 
 
+def check_11(recsys):
+    ids = np.argsort(-recsys.POPULARITY)[:40]  # each of them is clicked 7 times in 10
+    env = recsys.RecSysEnv(ids, 2)
+    env.reset(seed=0)
+    counts = np.zeros((2, 2), int)  # of the first product, then of the second: clicks, tries
+    again = np.zeros(2, int)  # the first product, once it was clicked: clicks, tries
+    for _ in range(300):
+        env.reset()
+        for choice in (0, 1):  # each of them until it is clicked, then three times more
+            clicked = False
+            left = 3
+            while left and not env.ending:
+                click = bool(env.step(choice)[1])
+                left -= clicked
+                if clicked:
+                    again += (click, 1)
+                else:
+                    counts[choice] += (click, 1)
+                clicked |= click
+    if again[0] > 0.6 * again[1]:
+        raise Wrong("not begun: what was clicked is clicked again, as before")
+    seen = f"{again[0]} clicks in {again[1]} tries"
+    expect(again[0] == 0, "no second click of a product in an episode", seen)
+    for clicks, tries in counts:  # the second product, and all of them after a reset
+        expected = "first clicks as often as before, after every reset, for every product"
+        expect(clicks > 0.6 * tries, expected, f"{clicks} clicks in {tries} tries")
+
+    env = recsys.RecSysEnv(recsys.split_actions()["test"], 500)
+    rng = np.random.default_rng(0)
+    for policy in ("oracle", "mu-only"):
+        ctr = []
+        for seed in range(40):
+            ctr.append(recsys.play(env, policy, rng, seed))
+            bought = set()
+            for choice, click in zip(env.choices, env.clicks, strict=True):
+                again = choice in bought
+                expect(not again, "`play` to recommend nothing that was clicked", f"{policy} does")
+                if click:
+                    bought.add(choice)
+        expect(np.mean(ctr) > 0.5, f"a CTR above 0.5 of {policy}, which remembers", np.mean(ctr))
+
+
+def check_12(hvae):
+    module = load_environment("gridworld")
+    split = module.split_actions()
+    held_out = np.union1d(split["valid"], split["test"])
+    rng = np.random.default_rng(0)
+    table = rng.normal(3.0, 0.02, (1024, 8))  # says nothing, around 3
+    table[:, :3] = module.engineered_representations()[:, :3]  # says something
+    table[split["train"], 3] *= rng.uniform(size=512)  # of training skills alone
+    scores = hvae.probe(table, split["train"], held_out)
+    if "dims_in_use" not in scores:
+        raise Wrong("not begun: probe has no score dims_in_use")
+    expected = "3 dimensions in use (standard deviation above 0.1 over the held-out actions)"
+    expect(scores["dims_in_use"] == 3, expected, scores["dims_in_use"])
+    expect("nn_class" in scores, "the other scores as well", [*scores])
+
+
 def check_same(ppo):
-    weights, expected = train(ppo), train(reference)
+    weights = train(ppo)
+    load("gridworld", ROOT / "gridworld.py")  # in place of the one that was handed in
+    expected = train(reference)
     others = weights.keys() ^ expected.keys()
     expect(not others, "no other layers while new options are off", others)
     for name, x in expected.items():
@@ -334,32 +423,42 @@ def check_same(ppo):
 
 # ---- the command line ----
 
-CHECKS = {"02": check_02, "03": check_03, "05": check_05, "06": check_06, "07": check_07}
-CHECKS |= {"08": check_08, "09": check_09, "same": check_same}
+CHECKS = {"01": check_01, "02": check_02, "03": check_03, "04": check_04, "05": check_05}
+CHECKS |= {"06": check_06, "07": check_07, "08": check_08, "09": check_09, "11": check_11}
+CHECKS |= {"12": check_12, "same": check_same}
+# What is handed in, if it is not the policy script (for 9: Grid World as well, so a folder).
+FILES = {"01": "order.py", "03": "gridworld.py", "04": "net.npz", "11": "recsys.py"}
+FILES |= {"12": "hvae.py"}
 
 
 def grade(number, work):
-    """Check a script, or a folder of scripts: "ok", or a sentence that says what is wrong."""
+    """Check a file, or a folder of files: "ok", or a sentence that says what is wrong."""
     work = work.resolve()
-    grid, policy = ROOT / "gridworld.py", ROOT / "ppo_actiongen.py"
+    main = FILES.get(number, "ppo_actiongen.py")
+    paths = {name: ROOT / name for name in ("gridworld.py", main)}
     try:
         if work.is_dir():
-            grid = work / grid.name if (work / grid.name).exists() else grid
-            policy = work / policy.name if (work / policy.name).exists() else policy
-        elif "class GridWorldEnv" in work.read_text(encoding="utf-8"):
-            grid = work
+            paths.update({name: work / name for name in paths if (work / name).exists()})
+        elif work.suffix == ".py" and "class GridWorldEnv" in work.read_text(encoding="utf-8"):
+            paths["gridworld.py"] = work
         else:
-            policy = work
+            paths[main] = work
+        if not paths[main].exists():
+            raise Wrong(f"not begun: there is no {main}")
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            load("gridworld", grid)
-            CHECKS[number](load("ppo_actiongen", policy))
+            handed_in = load("gridworld", paths["gridworld.py"])
+            if main == "net.npz":
+                handed_in = paths[main]
+            elif main != "gridworld.py":
+                handed_in = load("handed_in", paths[main])
+            CHECKS[number](handed_in)
     except Wrong as e:
         return str(e)
     except (Exception, SystemExit) as e:
         # A script that fails: where in it was that?
         where = ""
         for frame in traceback.extract_tb(e.__traceback__):
-            if Path(frame.filename) in (grid, policy):
+            if Path(frame.filename) in paths.values():
                 where = f" ({Path(frame.filename).name}, line {frame.lineno})"
         return f"{type(e).__name__}: {e}{where}".replace("\n", " ")
     return "ok"
