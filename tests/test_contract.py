@@ -1,4 +1,4 @@
-"""The contract that every environment file keeps, run over all four of them."""
+"""What every environment file has to hold; then what the four of this repository promise."""
 
 import copy
 import importlib
@@ -12,11 +12,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import wrappers
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from PIL import Image
 
+import hvae
+
 ROOT = Path(__file__).parent.parent
+DIAL = str(ROOT / "exercises/dial.py")  # an environment of one's own
 ENVIRONMENTS = {  # file -> (class, id, actions in all and in each part of the default split)
     "gridworld": ("GridWorldEnv", "GridWorld", (1024, 512, 256, 256)),
     "recsys": ("RecSysEnv", "RecSys", (10_000, 5_000, 2_500, 2_500)),
@@ -25,11 +29,20 @@ ENVIRONMENTS = {  # file -> (class, id, actions in all and in each part of the d
 }
 
 
+def load(name):
+    if name == "stacking_env":
+        pytest.importorskip("pybullet", reason="Shape Stacking needs pybullet")
+    return hvae.load_environment(name) if name == DIAL else importlib.import_module(name)
+
+
+@pytest.fixture(params=[*ENVIRONMENTS, DIAL], ids=lambda name: Path(name).stem)
+def environment(request):
+    return load(request.param)
+
+
 @pytest.fixture(params=ENVIRONMENTS)
 def module(request):
-    if request.param == "stacking_env":
-        pytest.importorskip("pybullet", reason="Shape Stacking needs pybullet")
-    return importlib.import_module(request.param)
+    return load(request.param)
 
 
 def make(module, **options):
@@ -37,8 +50,109 @@ def make(module, **options):
     return gym.make(f"ActionGen/{name}-v0", disable_env_checker=True, **options)
 
 
+def make_own(module, **options):
+    """The environment's class, as ppo_actiongen.py finds it, with seven available actions."""
+    classes = [x for x in vars(module).values() if isinstance(x, type) and issubclass(x, gym.Env)]
+    (own,) = [x for x in classes if x.__module__ == module.__name__]
+    pool = dict(action_pool=module.split_actions()["train"], num_available=7)
+    spec = EnvSpec("Own-v0", own, disable_env_checker=True, kwargs=pool)
+    return gym.make(spec, **options).unwrapped
+
+
 def equal(a, b):
     return all(np.array_equal(a[k], b[k]) for k in a)
+
+
+# ---- every environment ----
+
+
+def test_the_parts_of_every_split_are_known_and_disjoint(environment):
+    for name in getattr(environment, "SPLITS", ("default",)):
+        split = environment.split_actions(name, 1)
+        assert list(split) == ["train", "valid", "test"]
+        together = np.concatenate([*split.values()])
+        assert len(np.unique(together)) == len(together) > 0
+        assert together.min() >= 0 and together.max() < environment.NUM_ACTIONS
+        assert getattr(environment, "NO_OP", -1) not in together
+        assert equal(split, environment.split_actions(name, 1))
+
+
+def test_representations_and_labels_have_one_row_per_action(environment):
+    table = environment.engineered_representations()
+    assert len(table) == environment.NUM_ACTIONS and table.dtype == np.float32
+    assert np.isfinite(table).all()
+    assert environment.action_labels().shape == (environment.NUM_ACTIONS,)
+
+
+def test_action_observations_depend_on_the_seed_and_the_action_alone(environment):
+    no_op = getattr(environment, "NO_OP", 0)  # an action like every other
+    for modality in environment.MODALITIES:
+        several = environment.action_observations([40, no_op, 3], 4, modality, 1)
+        one = environment.action_observations(np.array([no_op]), 4, modality, 1, 2)  # 2 workers
+        assert several.shape[:2] == (3, 4) and np.array_equal(several[1:2], one)
+
+
+def test_check_env_has_nothing_to_say(environment, recwarn):
+    env = make_own(environment, render_mode="rgb_array")
+    check_env(env, skip_render_check=False)
+    assert [str(w.message) for w in recwarn if "gymnasium" in str(w.filename)] == []
+    env.reset(seed=0)
+    frames = env.render_frames()
+    assert np.array_equal(frames[-1], env.render()) and frames[-1].dtype == np.uint8
+    env.close()
+
+
+def play(environment, seed, steps, n=3):
+    pool = environment.split_actions()["valid"]
+    envs = environment.make_vec(n, pool, 7, seed)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    envs.action_space.seed(0)
+    obs, _ = envs.reset()
+    trace, scores = [obs], []
+    for _ in range(steps):
+        assert all(len(set(row)) == 7 for row in obs["available"].tolist())
+        assert np.isin(obs["available"], [getattr(environment, "NO_OP", pool[0]), *pool]).all()
+        action = envs.action_space.sample()
+        if isinstance(action, dict) and "stop" in action:
+            action["stop"][:] = 0
+        obs, reward, terminated, truncated, infos = envs.step(action)
+        trace.append(copy.deepcopy(obs) | dict(reward=reward, ended=terminated, late=truncated))
+        if (done := terminated | truncated).any():
+            final = infos["final_info"]
+            assert (infos["_final_info"] == done).all() and "episode" not in final
+            scores += final[environment.METRIC][done].tolist()
+    envs.close()
+    return trace, scores
+
+
+def test_one_seed_gives_one_sequence_and_episodes_end_with_a_score(environment):
+    state = np.random.get_state()[1].tolist()  # noqa: NPY002
+    steps = 120 if environment.__name__ == "recsys" else 35
+    (a, scores), (b, again), (c, _) = (play(environment, s, steps) for s in (5, 5, 6))
+    assert scores and scores == again and all(map(equal, a, b))
+    assert not all(map(equal, a, c))
+    assert np.random.get_state()[1].tolist() == state  # noqa: NPY002 (left alone)
+
+
+def test_neighbouring_seeds_share_no_environment(environment):
+    first = []
+    for seed in (0, 1, [0, 1], [1, 1]):  # a list: a stream, as in ppo_actiongen.py
+        envs = environment.make_vec(3, environment.split_actions()["train"], 7, seed)
+        first += envs.reset()[0]["available"].tolist()
+        again = envs.reset(seed=[5, 6, 7])[0]
+        assert equal(again, envs.reset(seed=[5, 6, 7])[0])
+        envs.close()
+    assert len(set(map(tuple, first))) == 12
+
+
+def test_a_gif_shows_every_picture(environment, tmp_path):
+    frames = [np.full((6, 5, 3), shade, np.uint8) for shade in (0, 255)]
+    environment.save_gif(tmp_path / "a.gif", frames, 10)
+    with Image.open(tmp_path / "a.gif") as picture:
+        assert (picture.size, picture.n_frames, picture.info["duration"]) == ((5, 6), 2, 100)
+
+
+# ---- the four of this repository, besides ----
 
 
 def test_files_import_neither_torch_nor_each_other(module):
@@ -78,96 +192,34 @@ def test_make_vec_needs_no_more_than_a_number(module):
     envs.close()
 
 
-def test_check_env_has_nothing_to_say(module, recwarn):
-    env = make(module, render_mode="rgb_array")
-    check_env(env.unwrapped, skip_render_check=False)
-    assert [str(w.message) for w in recwarn if "gymnasium" in str(w.filename)] == []
-    env.close()
-
-
 def test_the_default_split_comes_first_and_is_of_the_papers_size(module):
     total, *sizes = ENVIRONMENTS[module.__name__][2]
     split = module.split_actions()
     assert total == module.NUM_ACTIONS and [*map(len, split.values())] == sizes
     assert equal(split, module.split_actions(module.SPLITS[0], seed=0))
     assert not np.array_equal(split["test"], module.split_actions(seed=1)["test"])
+    assert all((np.diff(ids) > 0).all() for ids in split.values())
     with pytest.raises(ValueError, match="nonsense"):
         module.split_actions("nonsense")
 
 
-def test_the_parts_of_every_split_are_sorted_known_and_disjoint(module):
-    for name in module.SPLITS:
-        split = module.split_actions(name, seed=1)
-        assert list(split) == ["train", "valid", "test"]
-        assert all((np.diff(ids) > 0).all() for ids in split.values())
-        together = np.concatenate([*split.values()])
-        assert len(np.unique(together)) == len(together) > 0
-        assert together.min() >= 0 and together.max() < module.NUM_ACTIONS
-        assert getattr(module, "NO_OP", -1) not in together
-
-
-def test_representations_and_labels_have_one_row_per_action(module):
-    table = module.engineered_representations()
-    assert len(table) == module.NUM_ACTIONS and table.dtype == np.float32
-    assert np.isfinite(table).all() and module.action_labels().shape == (module.NUM_ACTIONS,)
-
-
-def test_action_observations_depend_on_the_seed_and_the_action_alone(module):
-    no_op = getattr(module, "NO_OP", 0)  # an action like every other
+def test_what_does_not_exist_is_refused(module):
     for modality in module.MODALITIES:
-        several = module.action_observations([40, no_op, 3], 4, modality, seed=1)
-        one = module.action_observations(np.array([no_op]), 4, modality, seed=1, workers=2)
-        assert several.shape[:2] == (3, 4) and np.array_equal(several[1:2], one)
         with pytest.raises(ValueError):
             module.action_observations([module.NUM_ACTIONS], 4, modality)
     with pytest.raises(ValueError):
         module.action_observations([3], 4, "smell")
-
-
-def play(module, seed, steps, n=3):
-    pool = module.split_actions()["valid"]
-    envs = module.make_vec(n, pool, 7, seed)
-    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-    envs.action_space.seed(0)
-    obs, _ = envs.reset()
-    trace, scores = [obs], []
-    for _ in range(steps):
-        assert all(len(set(row)) == 7 for row in obs["available"].tolist())
-        assert np.isin(obs["available"], [getattr(module, "NO_OP", pool[0]), *pool]).all()
-        action = envs.action_space.sample()
-        if isinstance(action, dict) and "stop" in action:
-            action["stop"][:] = 0
-        obs, reward, terminated, truncated, infos = envs.step(action)
-        trace.append(copy.deepcopy(obs) | dict(reward=reward, ended=terminated, late=truncated))
-        if (done := terminated | truncated).any():
-            final = infos["final_info"]
-            assert (infos["_final_info"] == done).all() and "episode" not in final
-            scores += final[module.METRIC][done].tolist()
-    envs.close()
-    return trace, scores
-
-
-def test_one_seed_gives_one_sequence_and_episodes_end_with_a_score(module):
-    state = np.random.get_state()[1].tolist()  # noqa: NPY002
-    steps = 120 if module.__name__ == "recsys" else 35
-    (a, scores), (b, again), (c, _) = (play(module, s, steps) for s in (5, 5, 6))
-    assert scores and scores == again and all(map(equal, a, b))
-    assert not all(map(equal, a, c))
-    assert np.random.get_state()[1].tolist() == state  # noqa: NPY002 (left alone)
-
-
-def test_neighbouring_seeds_share_no_environment_and_bad_ones_are_refused(module):
-    first = []
-    for seed in (0, 1):
-        envs = module.make_vec(3, None, 7, seed)
-        first += envs.reset()[0]["available"].tolist()
-        envs.close()
-    assert len(set(map(tuple, first))) == 6
     for bad, error in ((-1, ValueError), (2.0, TypeError)):
         with pytest.raises(error):
             module.make_vec(1, None, 7, bad)
         with pytest.raises(error):
             module.split_actions(seed=bad)
+    create = getattr(module, ENVIRONMENTS[module.__name__][0])
+    unknown = [1, 2, module.NUM_ACTIONS]
+    for pool, K in (([1, 2, 3], 5), ([1, 2, 2, 3], 2), (unknown, 2), ([1, 2, 3], 0), ([[1, 2]], 1),
+                    ([1.0, 2.0], 2), ([-1, 2], 2), ([], 1)):  # fmt: skip
+        with pytest.raises(ValueError):
+            create(np.array(pool), K)
 
 
 def test_with_the_whole_pool_available_positions_have_a_fixed_meaning(module):
@@ -176,15 +228,6 @@ def test_with_the_whole_pool_available_positions_have_a_fixed_meaning(module):
     first, second = (envs.reset()[0]["available"] for _ in range(2))
     assert (first == second).all() and (first[0] == first[1]).all()
     envs.close()
-
-
-def test_bad_pools_are_refused(module):
-    create = getattr(module, ENVIRONMENTS[module.__name__][0])
-    unknown = [1, 2, module.NUM_ACTIONS]
-    for pool, K in (([1, 2, 3], 5), ([1, 2, 2, 3], 2), (unknown, 2), ([1, 2, 3], 0), ([[1, 2]], 1),
-                    ([1.0, 2.0], 2), ([-1, 2], 2), ([], 1)):  # fmt: skip
-        with pytest.raises(ValueError):
-            create(np.array(pool), K)
 
 
 def test_a_step_before_the_reset_or_after_the_end_is_refused(module):
@@ -200,13 +243,10 @@ def test_a_step_before_the_reset_or_after_the_end_is_refused(module):
 
 
 def test_pictures_are_drawn_only_where_they_were_asked_for(module):
-    env, silent = make(module, render_mode="rgb_array").unwrapped, make(module).unwrapped
-    env.reset(seed=0)
-    frames = env.render_frames()
-    assert np.array_equal(frames[-1], env.render()) and frames[-1].dtype == np.uint8
+    silent = make(module).unwrapped
     silent.reset(seed=0)
     assert silent.render_frames() == [] and silent.render() is None
-    env.close(), silent.close()
+    silent.close()
 
 
 def test_gymnasiums_wrappers_work(module):
@@ -235,7 +275,6 @@ def test_a_gif_rests_on_its_end_and_appears_whole_or_not_at_all(module, tmp_path
     frames = [np.full((6, 5, 3), shade, np.uint8) for shade in (0, 255)]
     module.save_gif(tmp_path / "new" / "a.gif", frames, fps=10)
     with Image.open(tmp_path / "new" / "a.gif") as picture:
-        assert (picture.size, picture.n_frames, picture.info["duration"]) == ((5, 6), 2, 100)
         picture.seek(1)
         assert picture.info["duration"] == 2000
 
