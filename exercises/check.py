@@ -353,31 +353,30 @@ def check_09(ppo):
 
 
 def check_11(recsys):
-    ids = np.argsort(-recsys.POPULARITY)[:40]  # each of them is clicked 7 times in 10
+    ids = np.argsort(-recsys.POPULARITY)[:40]  # a try is a click 6 times in 10
     env = recsys.RecSysEnv(ids, 2)
     env.reset(seed=0)
-    counts = np.zeros((2, 2), int)  # of the first product, then of the second: clicks, tries
-    again = np.zeros(2, int)  # the first product, once it was clicked: clicks, tries
+    first = np.zeros((2, 2), int)  # clicks and tries of two products, up to their first click
+    again = np.zeros(2, int)  # and afterwards
     for _ in range(300):
         env.reset()
-        for choice in (0, 1):  # each of them until it is clicked, then three times more
-            clicked = False
-            left = 3
-            while left and not env.ending:
-                click = bool(env.step(choice)[1])
-                left -= clicked
-                if clicked:
-                    again += (click, 1)
-                else:
-                    counts[choice] += (click, 1)
-                clicked |= click
-    if again[0] > 0.6 * again[1]:
+        clicked = [False, False]
+        for choice in [0] * 6 + [1] * 6 + [0] * 3:
+            if env.ending:
+                break
+            click = bool(env.step(choice)[1])
+            if clicked[choice]:
+                again += (click, 1)
+            else:
+                first[choice] += (click, 1)
+            clicked[choice] |= click
+    if again[0] > 0.45 * again[1]:
         raise Wrong("not begun: what was clicked is clicked again, as before")
     seen = f"{again[0]} clicks in {again[1]} tries"
     expect(again[0] == 0, "no second click of a product in an episode", seen)
-    for clicks, tries in counts:  # the second product, and all of them after a reset
+    for clicks, tries in first:
         expected = "first clicks as often as before, after every reset, for every product"
-        expect(clicks > 0.6 * tries, expected, f"{clicks} clicks in {tries} tries")
+        expect(clicks > 0.45 * tries, expected, f"{clicks} clicks in {tries} tries")
 
     env = recsys.RecSysEnv(recsys.split_actions()["test"], 500)
     rng = np.random.default_rng(0)
@@ -399,13 +398,13 @@ def check_12(hvae):
     split = module.split_actions()
     held_out = np.union1d(split["valid"], split["test"])
     rng = np.random.default_rng(0)
-    table = rng.normal(3.0, 0.02, (1024, 8))  # says nothing, around 3
+    table = rng.normal(3.0, 0.3, (1024, 8))  # says little, around 3
     table[:, :3] = module.engineered_representations()[:, :3]  # says something
     table[split["train"], 3] *= rng.uniform(size=512)  # of training skills alone
     scores = hvae.probe(table, split["train"], held_out)
     if "dims_in_use" not in scores:
         raise Wrong("not begun: probe has no score dims_in_use")
-    expected = "3 dimensions in use (standard deviation above 0.1 over the held-out actions)"
+    expected = "3 dimensions in use (standard deviation above 0.5 over the held-out actions)"
     expect(scores["dims_in_use"] == 3, expected, scores["dims_in_use"])
     expect("nn_class" in scores, "the other scores as well", [*scores])
 

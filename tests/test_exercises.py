@@ -1,19 +1,36 @@
 """Worked solutions apply, are short and pass their checks, which say what is wrong with others."""
 
+import csv
 import importlib
+import re
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import gridworld
+import hvae
+
 ROOT = Path(__file__).parent.parent
-SCRIPTS = "ppo_actiongen.py", "gridworld.py"
+pytestmark = pytest.mark.filterwarnings("ignore:.*Overriding environment")
+SCRIPTS = "ppo_actiongen.py", "gridworld.py", "recsys.py", "hvae.py"
+TEXT = (ROOT / "exercises/README.md").read_text(encoding="utf-8")
 SOLUTIONS = sorted(ROOT.glob("exercises/solutions/*.patch"))
 
 # Changes of the worked solutions: words of the check's answer; texts and what replaces them.
 CHANGES = {
+    "01": [
+        ("rounding alone", {"before[:, order]": "before"}),
+        (
+            "logits go by the place",
+            {"after - before[:, order]": "after.sort()[0] - before.sort()[0]"},
+        ),
+        ("logits go by the place", {"torch.randperm": "torch.arange"}),
+    ],
     "02": [
         ("ok", {"project(self.table[available])": "project(self.table)[available]"}),
         ("the same logits", {"cat([states, actions]": "cat([actions, states]"}),
@@ -59,6 +76,16 @@ CHANGES = {
         ("probability 0", {".masked_fill(available < 0, -torch.inf)": ""}),
         ("truncated when", {"(moves >= MAX_MOVES or nothing_left)": "(moves >= MAX_MOVES)"}),
     ],
+    "11": [
+        ("after every reset", {"self.clicked = []": "self.clicked = getattr(self, 'clicked', [])"}),
+        ("no second click", {"self.clicked.append(product)": "self.clicked = [product]"}),
+        ("`play` to recommend nothing", {"np.where(bought, -np.inf, score)": "score"}),
+        ("CTR above 0.5 of oracle", {"score).argmax()": "-score).argmax()"}),
+    ],
+    "12": [
+        ("3 dimensions", {"mean[held_out_ids].std(0)": "mean.std(0)"}),
+        ("3 dimensions", {"mean[held_out_ids].std(0)": "abs(mean[held_out_ids]).mean(0)"}),
+    ],
 }
 
 
@@ -76,7 +103,45 @@ def test_reference_of_the_checks_is_the_policy_script():
     assert texts[0] == texts[1], "cp ppo_actiongen.py exercises/reference/"
 
 
-@pytest.mark.filterwarnings("ignore:.*Overriding environment")
+def test_an_agent_comes_from_a_run_as_exercise_1_says(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    (code,) = re.findall(r" ```python\n(.*?)```", TEXT, re.S)
+    names = {}
+    exec(textwrap.dedent(code), names)
+    assert names["logits"].shape == names["available"].shape == (8, 50)
+
+
+def test_numbers_to_expect_are_those_of_the_results():
+    with open(ROOT / "results/exercises.csv", encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    texts = re.split(r"^\d+\. ", TEXT, flags=re.M)  # what stands before exercise 1, then each
+    assert len(texts) == 13 and all("*Expect*" in text for text in texts[1:10] + texts[11:])
+    for row in rows:
+        number = int(row["exercise"])
+        text = texts[number]
+        assert row["shown"] in text, row
+        digits = len(row["shown"].partition(".")[2])
+        assert f"{float(row['score']):.{digits}f}" == row["shown"], row
+    assert {int(row["exercise"]) for row in rows} == {0, *range(2, 10), 11, 12}
+
+
+def test_exercise_4_takes_means_of_recordings_alone(check, tmp_path):
+    recorded = gridworld.action_observations(np.arange(1024), 16, "xy").astype(np.float32)
+    moved = (recorded[:, :, -1] - recorded[:, :, 0]).mean(1)
+    bytes_ = recorded.astype(np.uint8)
+    tables = {
+        "ok": moved,
+        "net_r2 above": (bytes_[:, :, -1] - bytes_[:, :, 0]).mean(1),
+        "two numbers": recorded[:, :, -1].mean(1).repeat(2, axis=1),
+        "walls stop": gridworld.engineered_representations()[:, :2],
+    }
+    for answer, table in tables.items():
+        hvae.save_representation(tmp_path / "net.npz", table, [], {"env": "gridworld"})
+        for work in (tmp_path, tmp_path / "net.npz"):
+            assert answer in check.grade("04", work)
+    assert check.grade("04", ROOT).startswith("not begun")
+
+
 @pytest.mark.parametrize("patch", SOLUTIONS, ids=lambda patch: patch.stem)
 def test_solution_is_short_and_passes_and_wrong_ones_are_refused(patch, check, tmp_path):
     number = patch.stem[:2]
@@ -93,11 +158,11 @@ def test_solution_is_short_and_passes_and_wrong_ones_are_refused(patch, check, t
     for answer, replacements in CHANGES[number]:
         folder = tmp_path / str(len(folders))
         folder.mkdir()
-        for script in SCRIPTS:
-            text = (solved / script).read_text(encoding="utf-8")
+        for script in solved.glob("*.py"):
+            text = script.read_text(encoding="utf-8")
             for old, new in replacements.items():
                 text = text.replace(old, new)
-            (folder / script).write_text(text, encoding="utf-8")
+            (folder / script.name).write_text(text, encoding="utf-8")
         folders.append(folder)
         answers.append(answer)
     for folder, answer in zip(folders, answers, strict=True):

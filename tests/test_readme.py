@@ -1,14 +1,16 @@
 """Both READMEs against the repository: names exist, commands are accepted, tables equal the CSV."""
 
+import csv
 import importlib
 import json
 import os
 import re
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
+import gridworld
 import hvae
 import ppo_actiongen
 
@@ -34,7 +36,7 @@ def test_every_name_of_the_paper_map_exists():
 
 
 def test_every_script_picture_and_heading_they_link_to_exists():
-    for path in set(re.findall(r"python (?:-m )?([\w/]+\.py)", TEXT)) - {"dial.py"}:
+    for path in set(re.findall(r"python (?:-m )?([\w/]+\.py)", TEXT)):
         assert (ROOT / path).exists(), path
     for page, text in PAGES.items():
         for path, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
@@ -67,10 +69,33 @@ def test_every_figure_and_flag_it_names_is_known():
             assert flag in known, flag
 
 
-def save_example(start: str, path: Path) -> None:
-    """Save the README's Python example that begins with these words."""
-    (text,) = (t for t in re.findall(r"```python\n(.*?)```", TEXT, re.S) if t.startswith(start))
-    path.write_text(text, encoding="utf-8")
+def test_costs_are_those_of_the_csv_files():
+    rows = re.findall(
+        r"^\|`(\w+) .*?\|([\d.]+)M\|([\d to]+)\|([\d.]+)\|([\w-]+\.csv)\|$", TEXT, re.M
+    )
+    rows += re.findall(
+        r"^\|`(\w+)`.*?\|([\d.]+)M\|([\d to]+)\|([\d.]+)\|([\w-]+\.csv)\|$", TEXT, re.M
+    )
+    assert len(rows) == 9
+    for env, millions, minutes, score, name in rows:
+        methods = ("ours_bilinear",) if env == "recsys" else ("ours", "ours_conditioned_auxiliary")
+        found = []
+        with open(ROOT / "results" / name, encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                near = abs(int(row["steps"] or 0) / 1e6 - float(millions)) < 0.003 * float(millions)
+                if (
+                    near
+                    and row["env"] == env
+                    and row["method"] in methods
+                    and row["phase"] == "test"
+                ):
+                    found.append((float(row["score"]), round(60 * float(row["hours"]))))
+        scores, times = zip(*found, strict=True)
+        assert f"{sum(scores) / len(scores):.3f}" == score, (env, name)
+        assert sorted({min(times), max(times)}) == [int(x) for x in minutes.split(" to ")], (
+            env,
+            name,
+        )
 
 
 def run(folder: Path, words: str) -> str:
@@ -80,21 +105,33 @@ def run(folder: Path, words: str) -> str:
 
 
 def test_example_of_an_own_environment_learns_unseen_actions(tmp_path):
-    save_example('"""Turn a dial', tmp_path / "dial.py")
-    run(tmp_path, "dial.py --total-timesteps 20480 --eval-episodes 300")
-    (folder,) = (tmp_path / "runs").iterdir()
-    assert folder.name == "dial-total_timesteps-20480-eval_episodes-300-s0"
+    dial = ROOT / "exercises/dial.py"
+    blocks = re.findall(r"```python\n(.*?)```", TEXT, re.S)
+    assert any(block in dial.read_text("utf-8") for block in blocks)  # its core
+    words = "--representation engineered --total-timesteps 20480 --eval-episodes 300"
+    run(tmp_path, f"{dial} {words} --run-name dial")
+    folder = tmp_path / "runs/dial"
     # by chance 0.23: 4 moves of 0.4 in 2 pi
     assert json.loads((folder / "results.json").read_text())["test"]["score"] > 0.6
     assert (folder / "episode.gif").exists()
     assert "success" in run(ROOT, f"evaluate {folder} --episodes 20")  # found from everywhere
 
 
+def test_example_of_an_own_environment_gets_an_encoder(tmp_path):
+    args = hvae.default_args(str(ROOT / "exercises/dial.py"), "quick")
+    path = hvae.train(replace(args, runs_dir=str(tmp_path)))
+    assert json.loads(path.with_suffix(".json").read_text())["engineered_r2"] > 0.9
+
+
 def test_example_of_an_own_action_encoder_is_accepted_by_the_policy(tmp_path):
-    save_example('"""Another action encoder', tmp_path / "encode.py")
+    (text,) = (t for t in re.findall(r"```python\n(.*?)```", TEXT, re.S) if "Another action" in t)
+    (tmp_path / "encode.py").write_text(text, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "encode.py"], cwd=tmp_path, env=environment, check=True)
+    table = hvae.load_representation(tmp_path / "endpoints.npz", "gridworld")
+    ids = gridworld.split_actions()
+    assert hvae.probe(table["mean"], ids["train"], ids["test"])["move_accuracy"] > 0.99
     words = "--representation endpoints.npz --minibatch-size 64 --total-timesteps 512"
-    run(tmp_path, f"gridworld {words} --eval-episodes 8 --valid-episodes 8")
-    (found,) = (tmp_path / "runs").glob("gridworld*/results.json")
-    assert json.loads(found.read_text())["test"]["episodes"] == 8
+    run(tmp_path, f"gridworld {words} --eval-episodes 8 --valid-episodes 8 --run-name own")
+    results = json.loads((tmp_path / "runs/own/results.json").read_text())
+    assert results["test"]["episodes"] == 8
