@@ -182,8 +182,15 @@ def test_check_takes_numbers_and_files_and_says_where_a_script_fails(tmp_path):
     assert lines[3:] == [f"{ROOT}: exercise same: ok"]
 
 
+def test_same_refuses_a_grid_world_that_differs_while_its_option_is_off(check, tmp_path):
+    text = (ROOT / "gridworld.py").read_text(encoding="utf-8")
+    file = tmp_path / "berta.py"
+    file.write_text(text.replace("LAMBDA_SUBGOAL = 0.1", "LAMBDA_SUBGOAL = 0.2"), encoding="utf-8")
+    assert "same bits" in check.grade("same", file)
+
+
 def test_check_has_help_and_names_what_it_does_not_know(check, capsys):
     check.main(["--help"])
     assert capsys.readouterr().out.startswith("Does a solution do")
-    with pytest.raises(SystemExit, match="^error: berta.py is neither a file nor one of 02, 03,"):
+    with pytest.raises(SystemExit, match="^error: berta.py is neither a file nor one of 01, 02,"):
         check.main(["6", "berta.py"])
