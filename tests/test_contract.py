@@ -46,17 +46,12 @@ def module(request):
 
 
 def make(module, **options):
-    name = ENVIRONMENTS[module.__name__][1]
-    return gym.make(f"ActionGen/{name}-v0", disable_env_checker=True, **options)
-
-
-def make_own(module, **options):
-    """The environment's class, as ppo_actiongen.py finds it, with seven available actions."""
+    """The environment of this file, found as ppo_actiongen.py does; seven available actions."""
     classes = [x for x in vars(module).values() if isinstance(x, type) and issubclass(x, gym.Env)]
     (own,) = [x for x in classes if x.__module__ == module.__name__]
     pool = dict(action_pool=module.split_actions()["train"], num_available=7)
     spec = EnvSpec("Own-v0", own, disable_env_checker=True, kwargs=pool)
-    return gym.make(spec, **options).unwrapped
+    return gym.make(spec, **options)
 
 
 def equal(a, b):
@@ -93,7 +88,7 @@ def test_action_observations_depend_on_the_seed_and_the_action_alone(environment
 
 
 def test_check_env_has_nothing_to_say(environment, recwarn):
-    env = make_own(environment, render_mode="rgb_array")
+    env = make(environment, render_mode="rgb_array").unwrapped
     check_env(env, skip_render_check=False)
     assert [str(w.message) for w in recwarn if "gymnasium" in str(w.filename)] == []
     env.reset(seed=0)
@@ -145,11 +140,26 @@ def test_neighbouring_seeds_share_no_environment(environment):
     assert len(set(map(tuple, first))) == 12
 
 
-def test_a_gif_shows_every_picture(environment, tmp_path):
-    frames = [np.full((6, 5, 3), shade, np.uint8) for shade in (0, 255)]
-    environment.save_gif(tmp_path / "a.gif", frames, 10)
-    with Image.open(tmp_path / "a.gif") as picture:
-        assert (picture.size, picture.n_frames, picture.info["duration"]) == ((5, 6), 2, 100)
+def test_gymnasiums_wrappers_work(environment):
+    env = make(environment, render_mode="rgb_array")
+    flat = gym.spaces.flatdim(env.observation_space)
+    env = wrappers.RenderCollection(wrappers.TimeLimit(env, max_episode_steps=2))
+    env = wrappers.FlattenObservation(wrappers.RecordEpisodeStatistics(env))
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (flat,)
+    env.action_space.seed(0)
+    rewards, over = [], False
+    while not over:
+        action = env.action_space.sample()
+        if isinstance(action, dict) and "stop" in action:
+            action["stop"] = np.int64(0)  # Shape Stacking goes on
+        _, reward, terminated, truncated, info = env.step(action)
+        rewards.append(reward)
+        over = terminated or truncated
+    assert info["episode"]["l"] == len(rewards) <= 2
+    assert np.isclose(info["episode"]["r"], sum(rewards), atol=1e-5)
+    assert len(env.render()) == len(rewards) + 1
+    env.close()
 
 
 # ---- the four of this repository, besides ----
@@ -166,19 +176,18 @@ def test_files_import_neither_torch_nor_each_other(module):
     assert out.stdout.split()[-1:] == ["found"], out.stdout + out.stderr
 
 
-def test_the_files_agree_to_the_letter_where_they_do_the_same(module):
-    model = importlib.import_module("gridworld")
-    for name in ("check_ids", "save_gif"):
-        assert inspect.getsource(getattr(module, name)) == inspect.getsource(getattr(model, name))
-
-
-def test_names_of_the_contract_are_there(module):
+def test_the_four_have_the_same_names_and_the_same_small_functions(module):
     own = dict(
         gridworld="UNITS VARIANTS", create_env="UNITS TASKS NO_OP", stacking_env="PLACEMENTS"
     )
     names = "METRIC SPLITS MODALITIES NUM_ACTIONS NUM_AVAILABLE " + own.get(module.__name__, "")
     assert [name for name in names.split() if not hasattr(module, name)] == []
     assert {*getattr(module, "UNITS", {})} <= {"centre", "half_width", "step"}
+    model = importlib.import_module("gridworld")
+    for name in ("check_ids", "save_gif"):
+        assert inspect.getsource(getattr(module, name)) == inspect.getsource(getattr(model, name))
+    cls, id, _ = ENVIRONMENTS[module.__name__]
+    assert gym.spec(f"ActionGen/{id}-v0").entry_point == f"{module.__name__}:{cls}"
     for variant in getattr(module, "VARIANTS", ()):
         assert len(module.engineered_representations(variant)) == module.NUM_ACTIONS
 
@@ -230,51 +239,24 @@ def test_with_the_whole_pool_available_positions_have_a_fixed_meaning(module):
     envs.close()
 
 
-def test_a_step_before_the_reset_or_after_the_end_is_refused(module):
+def test_nothing_is_drawn_unasked_and_no_step_taken_outside_of_an_episode(module):
     env = make(module).unwrapped
     env.action_space.seed(0)
     with pytest.raises(gym.error.ResetNeeded):
         env.step(env.action_space.sample())
     env.reset(seed=0)
+    assert env.render_frames() == [] and env.render() is None
     while not any(env.step(env.action_space.sample())[2:4]):
         pass
     with pytest.raises(gym.error.ResetNeeded):
         env.step(env.action_space.sample())
 
 
-def test_pictures_are_drawn_only_where_they_were_asked_for(module):
-    silent = make(module).unwrapped
-    silent.reset(seed=0)
-    assert silent.render_frames() == [] and silent.render() is None
-    silent.close()
-
-
-def test_gymnasiums_wrappers_work(module):
-    env = make(module, render_mode="rgb_array")
-    flat = gym.spaces.flatdim(env.observation_space)
-    env = wrappers.RenderCollection(wrappers.TimeLimit(env, max_episode_steps=2))
-    env = wrappers.FlattenObservation(wrappers.RecordEpisodeStatistics(env))
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (flat,)
-    env.action_space.seed(0)
-    rewards, over = [], False
-    while not over:
-        action = env.action_space.sample()
-        if isinstance(action, dict) and "stop" in action:
-            action["stop"] = np.int64(0)  # Shape Stacking goes on
-        _, reward, terminated, truncated, info = env.step(action)
-        rewards.append(reward)
-        over = terminated or truncated
-    assert info["episode"]["l"] == len(rewards) <= 2
-    assert np.isclose(info["episode"]["r"], sum(rewards), atol=1e-5)
-    assert len(env.render()) == len(rewards) + 1
-    env.close()
-
-
 def test_a_gif_rests_on_its_end_and_appears_whole_or_not_at_all(module, tmp_path, monkeypatch):
     frames = [np.full((6, 5, 3), shade, np.uint8) for shade in (0, 255)]
     module.save_gif(tmp_path / "new" / "a.gif", frames, fps=10)
     with Image.open(tmp_path / "new" / "a.gif") as picture:
+        assert (picture.size, picture.n_frames, picture.info["duration"]) == ((5, 6), 2, 100)
         picture.seek(1)
         assert picture.info["duration"] == 2000
 
