@@ -63,6 +63,7 @@ CHANGES = {
                 "agent.noisy_table = agent.table  #": "#",
                 "action=None):": "action=None, clean=False):\n        self.clean = clean\n",
                 "self.noisy_table[": "(self.table if self.clean else self.noisy_table)[",
+                "linear(self.noisy_table,": "linear(self.table if self.clean else self.noisy_table,",
                 "def play_step(envs, obs, agent": "def play_step(envs, obs, agent, clean=False",
                 "act(state, available)": "act(state, available, clean=clean)",
                 " _, obs, infos = play_step(": " _, obs, infos = play_step(clean=True, ",
@@ -73,7 +74,7 @@ CHANGES = {
     "08": [("a mean", {"[available].mean(1)": "[available].sum(1)"})],
     "09": [
         ("no -1 taken", {"distance.masked_fill(available < 0, torch.inf)": "distance"}),
-        ("probability 0", {".masked_fill(available < 0, -torch.inf)": ""}),
+        ("probability 0", {"logits.masked_fill(available < 0, -torch.inf)": "logits"}),
         ("truncated when", {"(moves >= MAX_MOVES or nothing_left)": "(moves >= MAX_MOVES)"}),
     ],
     "11": [

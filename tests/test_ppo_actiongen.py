@@ -374,14 +374,12 @@ def test_a_run_leaves_what_it_promises(finished):
     assert set(best) == {"args", "agent", "step"}  # small: no optimiser
 
 
-def test_one_seed_gives_one_run_and_its_command_can_be_pasted(finished, tmp_path, monkeypatch):
-    line = words(tmp_path / "it's here")
-    monkeypatch.setattr(sys, "argv", ["/somewhere/ppo_actiongen.py", *line])
-    ppo.main(line)
-    folder = tmp_path / "it's here" / "run"
-    assert_same_run(finished[0], folder)
-    command = json.loads((folder / "results.json").read_text(encoding="utf-8"))["command"]
-    assert shlex.split(command) == ["python", "ppo_actiongen.py", *line]
+def test_one_seed_gives_one_run_and_its_command_can_be_pasted(finished, tmp_path):
+    folder = tmp_path / "it's here"
+    run("ppo_actiongen.py", *words(folder))
+    assert_same_run(finished[0], folder / "run")
+    command = json.loads((folder / "run" / "results.json").read_text(encoding="utf-8"))["command"]
+    assert shlex.split(command) == [sys.executable, "ppo_actiongen.py", *words(folder)]
 
 
 @pytest.mark.parametrize("rows", [1, 7])  # before the first checkpoint, and after it
@@ -455,7 +453,7 @@ REFUSED = """gridworld --num-available 600; 600 available
 gridworld --num-available 0; 0 available
 gridworld --eval-available 300; 300 available
 gridworld --total-timesteps 10; one rollout takes 2048
-gridworld --num-envs 33; num_envs 33: it must divide
+gridworld --num-envs 33; num_envs 33 must divide
 gridworld --representation missing.npz; missing.npz
 gridworld --representation hvea; 'hvea'; allowed: hvae, hvae-all, vae, engineered
 gridworld --representation engineered-6d; engineered-12d, engineered-5d
@@ -464,9 +462,7 @@ create --task pus; 'pus'; allowed: push
 stacking --placement 3d; '3d'; allowed: none, 1d, 2d
 gridworld --modality sound --representation hvae; 'sound'; allowed: xy
 recsys --representation vae; no action observations
-gridworld --finetune nowhere; nowhere/best.pt is no checkpoint
-gridworld --run-name a:b; run_name 'a:b'
-gridworld --run-name ..; run_name '..'
+gridworld --finetune nowhere; nowhere is not the folder of a finished run
 chess; chess
 nowhere.py; nowhere.py
 evaluate nowhere; nowhere/best.pt is no checkpoint"""
@@ -515,6 +511,8 @@ gridworld --split-seed 3 --device cpu; gridworld-split_seed-3-s0
 gridworld --ent-coef 0 --modality onehot; gridworld-modality-onehot-ent_coef-0.0-s0
 gridworld --representation a/my.npz; gridworld-representation-a_my.npz-s0
 gridworld --finetune C:\\x; gridworld-adapt-finetune-C__x-s0
+gridworld --run-name a:b; a_b
+gridworld --run-name ..; _.
 create --task seesaw --no-subgoal-reward; create-task-seesaw-subgoal_reward-False-s0"""
 
 
@@ -568,7 +566,7 @@ BREACHES = {  # an environment that makes a result wrong -> the sentence that re
     "outside": ("old = make_vec\ndef make_vec(n, pool=None, *rest):\n"
                 "    return old(n, np.setdiff1d(np.arange(1024), pool), *rest)\n",
                 "not in its action_pool"),
-    "short": ("def engineered_representations():\n    return np.ones((1023, 2))\n", "1024 finite"),
+    "short": ("def engineered_representations():\n    return np.ones((1023, 2))\n", r"\(1024, D\)"),
     "nan": ("def engineered_representations():\n    return np.full((1024, 2), np.nan)\n", "finite"),
     "silent": ("METRIC = 'height'\nclass MyEnv(GridWorldEnv):\n    pass\n", "metric 'height'"),
 }  # fmt: skip
@@ -734,7 +732,6 @@ def test_a_run_in_two_processes(tmp_path):
     assert [r["step"] for r in rows_of(tmp_path / "run")] == [str(256 * i) for i in range(1, 7)]
     results = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
     assert results["test"]["episodes"] == 64
-    assert results["command"].startswith("torchrun --nproc_per_node=2 ppo_actiongen.py gridworld")
     seen = ppo.load(tmp_path / "run" / "checkpoint.pt")["agent"]["obs_stats.sums"][0, 0].item()
     assert seen == pytest.approx(1536 + 1e-4)  # of both
     run(*TORCHRUN, "ppo_actiongen.py", *words(tmp_path, *extra, "--resume"))

@@ -42,7 +42,6 @@ that say so; [here] is a choice of this repository, with its reason.
 
 import atexit
 import csv
-import errno
 import json
 import math
 import os
@@ -172,12 +171,8 @@ TABLE_3 = {
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (410_000, 164_000, 615_000, 102_400),  # 25, 20, 50, 25 rollouts
-    "valid_episodes": (
-        640,
-        160,
-        640,
-        200,
-    ),  # stacking [code]: 40, too few to tell checkpoints apart
+    # stacking [code]: 40 episodes, too few to tell checkpoints apart.
+    "valid_episodes": (640, 160, 640, 200),
 }
 PRESETS = {}  # environment -> Args with its column of the table
 for number, environment in enumerate(TABLE_3["env"]):
@@ -247,9 +242,10 @@ def default_args(env="gridworld", recipe="fast", quick=False):
     module = hvae.load_environment(env)
     if env in PRESETS:
         args = PRESETS[env]
-    else:  # the absolute path, so that `evaluate` and --resume find the file from everywhere
-        own = getattr(module, "DEFAULTS", {})
-        args = Args(env=str(Path(env).resolve()), **own)
+    else:
+        # The absolute path, so that `evaluate` and --resume find the file from everywhere.
+        args = Args(env=str(Path(env).resolve()), **getattr(module, "DEFAULTS", {}))
+    # Later lines replace what earlier ones have set; the command line comes last (parse_args).
     args = replace(args, recipe=recipe, quick=quick)
     if recipe == "fast":
         args = replace(args, **FAST.get(env, {}))
@@ -340,7 +336,9 @@ class RunningMeanStd(nn.Module):
 
     def __init__(self, shape=()):
         super().__init__()
-        # Count, sum and sum of squares, as if 1e-4 numbers of variance 1 had been seen [code].
+        # Count, sum and sum of squares: from these three the statistics of all numbers follow, and
+        # they can be added up over batches and processes. They start as if 1e-4 numbers of variance
+        # 1 had been seen [code].
         prior = [torch.full(shape, x, dtype=torch.float64) for x in (1e-4, 0.0, 1e-4)]
         self.register_buffer("sums", torch.stack(prior))  # (3, *shape)
 
@@ -479,25 +477,18 @@ class Agent(nn.Module):
         W_s, W_c = self.utility_hidden.weight.chunk(2, dim=1)  # (H, H) each
         project = self.action_project
         state_part = F.linear(code, W_s, self.utility_hidden.bias)  # (B, H)
-
-        # The action's part is needed for those U actions only that are available somewhere in this
-        # batch. `row_of_id` says where among them the action of an id stands.
-        occurs = torch.zeros(len(self.table), dtype=torch.bool, device=code.device)
-        occurs[available] = True
-        row_of_id = occurs.cumsum(0) - 1  # (A,)
-        weight = W_c @ project.weight  # (H, D): two linear maps in a row are one
+        # For the actions, two linear maps follow each other, P and then W_c. They are one map.
+        weight = W_c @ project.weight  # (H, H) @ (H, D) -> (H, D)
         bias = W_c @ project.bias  # (H,)
-        action_part = F.linear(self.table[occurs], weight, bias)  # (U, H)
+        action_part = F.linear(self.table, weight, bias)  # (A, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
         # into the processor's cache, so they are made in pieces of 800,000 numbers (3 MB) [here].
         piece = max(1, 800_000 // (available.shape[1] * code.shape[1]))
         logits = []
-        for states, rows in zip(
-            state_part.split(piece), row_of_id[available].split(piece), strict=True
-        ):
-            actions = action_part.index_select(0, rows.flatten())  # (b * K, H)
-            hidden = states[:, None] + actions.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
+        for states, ids in zip(state_part.split(piece), available.split(piece), strict=True):
+            actions = action_part.index_select(0, ids.flatten())  # (b * K, H)
+            hidden = states[:, None] + actions.unflatten(0, ids.shape)  # (b, 1, H) + (b, K, H)
             logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
         return torch.cat(logits) + self.utility_out.bias
 
@@ -732,8 +723,8 @@ def train(args):
     # yet, rank 0 trains the encoder while the others wait.
     check(args)
     phases, train_ids = action_phases(args)
-    folder = gather_from_all(claim_folder(args) if RANK == 0 else None)[0]
-    table = gather_from_all(load_table(args) if RANK == 0 else None)[0]
+    mine = (claim_folder(args), load_table(args)) if RANK == 0 else None
+    folder, table = gather_from_all(mine)[0]
 
     # Environments, networks, optimiser. Environments draw from other streams of random numbers than
     # weights and actions do.
@@ -744,7 +735,6 @@ def train(args):
     agent = Agent(envs, table, train_ids, args).to(device)
     if args.finetune:
         start_from(agent, Path(args.finetune))
-    agent.load_state_dict(gather_from_all(agent.state_dict())[0])  # rank 0's weights for all
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
     reward_stats = RunningMeanStd().to(device)
 
@@ -754,7 +744,7 @@ def train(args):
     step = 0
     seconds = 0.0
     best_score = -math.inf
-    log_size = 0  # of metrics.csv
+    log_size = 0  # of metrics.csv, in bytes
     if args.resume and path.exists():
         checkpoint = load(path)
         put(checkpoint, path, **learned)
@@ -830,10 +820,10 @@ def train(args):
                 best = dict(args=vars(args), step=step, agent=agent.state_dict())
                 hvae.write(folder / "best.pt", partial(torch.save, best))
 
-        # Record what happened; scores of episodes come from all processes.
+        # Record what happened (under torchrun: to the environments of rank 0).
         lasted = time.perf_counter() - started
         seconds += lasted
-        score, total, length = episode_means(sum(gather_from_all(episodes), []))
+        score, total, length = episode_means(episodes)
         row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)
         row.update(train_score=train_score, valid_score=valid_score, learning_rate=learning_rate)
         row.update(episode_score=score, episode_return=total, episode_length=length, **numbers)
@@ -954,12 +944,17 @@ def action_phases(args):
     phases = {"learn": (action_pool, K), "train": (action_pool, train_K)}
     if not args.adapt:
         phases.update(valid=(split["valid"], eval_K), test=(split["test"], eval_K))
-    for phase, (pool, k) in phases.items():
-        if not 1 <= k <= len(with_no_op(pool, args)):
-            raise UserError(
-                f"{k} available actions: phase {phase!r} has {len(with_no_op(pool, args))}"
-            )
+    for phase in phases.values():
+        check_number(phase, args)
     return phases, with_no_op(action_pool, args)
+
+
+def check_number(phase, args):
+    """UserError if a phase, (action_pool, K), has fewer than K actions."""
+    action_pool, K = phase
+    most = len(with_no_op(action_pool, args))
+    if not 1 <= K <= most:
+        raise UserError(f"{K} available actions are asked for, but a pool has {most}")
 
 
 def load_table(args):
@@ -974,8 +969,7 @@ def load_table(args):
         if args.fully_observable:
             options["fully_observable"] = True
         table = module.engineered_representations(**options)
-        if len(table) != module.NUM_ACTIONS or not np.isfinite(table).all():
-            raise UserError(f"engineered_representations: not {module.NUM_ACTIONS} finite rows")
+        hvae.check_table("engineered_representations", table, module)
         return table
     path = Path(args.representation)
     if path.suffix == ".npz":
@@ -1030,11 +1024,12 @@ def check(args):
         hvae.choose("representation", args.representation, allowed)
     if args.device == "cuda" and not torch.cuda.is_available():
         raise UserError("device cuda: PyTorch finds no GPU here")
+    if args.finetune and not (Path(args.finetune) / "results.json").exists():
+        raise UserError(f"{args.finetune} is not the folder of a finished run")
     # A rollout is cut into whole steps of all environments, and into equal shares of processes.
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
-        processes = f"{WORLD_SIZE} processes, as minibatch_size"
-        raise UserError(f"num_envs {args.num_envs}: it must divide {size} and suit {processes}")
+        raise UserError(f"num_envs {args.num_envs} must divide the {size} steps of a rollout")
     if not 2 <= size <= args.total_timesteps:
         raise UserError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
     action_phases(args)
@@ -1044,24 +1039,21 @@ def check(args):
 
 FREE = ("runs_dir", "run_name", "resume", "device")  # these do not make another run
 TESTED = {"train": "seen", "valid": "validation", "test": "unseen"}  # phases and their titles
-PUBLISHED = {  # HVAE (recsys: engineered) + utility: seen, unseen (published_results.csv)
-    "gridworld": (0.904, 0.703),
-    "recsys": (0.322, 0.197),
-    "create": (0.907, 0.797),  # push
-    "stacking": (2.354, 1.716),
-}
 
 
 def run_name_of(args):
-    """<env>[-<option>-<value>]*-s<seed>, with the options that differ from the recipe."""
-    usual = vars(default_args(args.env, args.recipe, args.quick))
-    usual = dict(usual, recipe="fast", quick=False)
-    words = [hvae.environment_name(args.env)]
-    for name, value in vars(args).items():
-        if value != usual[name] and name not in ("seed", *FREE):
-            words.append(name if value is True else f"{name}-{value}")
+    """--run-name, or <env>[-<option>-<value>]*-s<seed> with the options that are not the usual."""
+    name = args.run_name
+    if name is None:
+        usual = vars(default_args(args.env, args.recipe, args.quick))
+        usual.update(recipe="fast", quick=False)
+        words = [hvae.environment_name(args.env)]
+        for option, value in vars(args).items():
+            if value != usual[option] and option not in ("seed", *FREE):
+                words.append(option if value is True else f"{option}-{value}")
+        name = "-".join(words)[:120] + f"-s{args.seed}"
     # Only what every file system takes, and no more of it than it takes.
-    return re.sub("[^A-Za-z0-9._-]", "_", "-".join(words))[:120] + f"-s{args.seed}"
+    return re.sub(r"^\.|[^A-Za-z0-9._-]", "_", name)[:140]
 
 
 def claim_folder(args):
@@ -1070,10 +1062,7 @@ def claim_folder(args):
     UserError if another process does, if there is a checkpoint but no --resume, or if --resume
     comes with other options than the run was started with.
     """
-    name = args.run_name or run_name_of(args)
-    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,139}", name):
-        raise UserError(f"run_name {name!r}: at most 140 letters, digits and . _ - are allowed")
-    folder = Path(args.runs_dir) / name
+    folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
     # Two processes in one folder would mix their rows. A lock of the operating system ends with its
     # process, however that ends.
@@ -1096,7 +1085,8 @@ def claim_folder(args):
 def load(path):
     """A checkpoint, its "args" as Args; UserError if it is missing, damaged or of other code."""
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)  # runs no code
+        # weights_only: numbers and names are read. A file from the internet could not run code.
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         checkpoint["args"] = Args(**checkpoint["args"])
     except Exception as e:  # for damaged files torch has a dozen kinds of errors
         reason = str(e).split("\n")[0]
@@ -1115,17 +1105,30 @@ def put(checkpoint, path, **learned):
             raise UserError(f"{path} does not fit this script and its options: {reason}") from None
 
 
+def append_row(path, row):
+    """A dictionary as the next line of a CSV file; a new file begins with the names."""
+    with open(path, "a", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
+        if file.tell() == 0:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def write_json(path, content):
+    text = json.dumps(content, indent=1)
+    hvae.write(path, lambda file: file.write(text.encode()))
+
+
 class Log:
     """A run's metrics.csv, TensorBoard events and progress bar."""
 
     def __init__(self, args, folder, step, size):
         from torch.utils.tensorboard import SummaryWriter  # here, because it takes 1.5 s
 
-        text = json.dumps(vars(args), indent=1)
-        hvae.write(folder / "args.json", lambda file: file.write(text.encode()))
-        self.file = open(folder / "metrics.csv", "a", encoding="utf-8", newline="")
-        self.file.truncate(size)  # rows after the checkpoint are made again
-        self.file.seek(size)
+        write_json(folder / "args.json", vars(args))
+        self.path = folder / "metrics.csv"
+        self.path.touch()
+        os.truncate(self.path, size)  # rows after the checkpoint are made again
         self.writer = SummaryWriter(folder, purge_step=step)
         print(f"run: {folder}", flush=True)
         steps = dict(total=args.total_timesteps, initial=step)
@@ -1133,11 +1136,7 @@ class Log:
 
     def write(self, row):
         """A row for one rollout, scores onto the screen; returns the size of metrics.csv."""
-        table = csv.DictWriter(self.file, row.keys(), lineterminator="\n")
-        if self.file.tell() == 0:
-            table.writeheader()
-        table.writerow(row)
-        self.file.flush()
+        append_row(self.path, row)
         for name, x in row.items():
             if x is not None:
                 self.writer.add_scalar(name, x, row["step"])
@@ -1146,41 +1145,34 @@ class Log:
             scores = "seen {train_score:.3f}, validation {valid_score:.3f}".format(**row)
             self.bar.set_postfix_str(scores)
             self.bar.write(f"step {row['step']:,}: {scores}")
-        return self.file.tell()
+        return self.path.stat().st_size
 
     def close(self):
         self.bar.close()
-        self.file.close()
         self.writer.close()
 
 
 def finish(folder, agent, phases, step, seconds):
-    """Test the best checkpoint; write results.json; then draw pictures and print the scores."""
+    """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
     args = agent.args
-    # Results are written first. Whatever goes wrong with a picture afterwards, they are safe.
     best = load(folder / "best.pt")
     put(best, folder, agent=agent)
     metric = hvae.load_environment(args.env).METRIC
-    launcher = f"torchrun --nproc_per_node={WORLD_SIZE}" if WORLD_SIZE > 1 else "python"
-    words = [Path(sys.argv[0]).name, *sys.argv[1:]]
-    results = dict(metric=metric, seed=args.seed, command=f"{launcher} {shlex.join(words)}")
+    results = dict(metric=metric, seed=args.seed, command=shlex.join(sys.orig_argv))
     results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
-    titles = {"train": "adapted to"} if args.adapt else TESTED
-    for phase in titles:
-        results[phase] = evaluate(agent, phases[phase], args.eval_episodes, (args.seed, 4))
-    text = json.dumps(results, indent=1)
-    hvae.write(folder / "results.json", lambda file: file.write(text.encode()))
-    try:
-        plot_curve(folder, metric)
-        record_episode(agent, phases["train" if args.adapt else "test"], folder / "episode.gif")
-    except Exception as e:
-        print(f"note: a picture is missing: {type(e).__name__}: {e}")
+    tested = {name: phase for name, phase in phases.items() if name in TESTED}
+    for name, phase in tested.items():
+        results[name] = evaluate(agent, phase, args.eval_episodes, (args.seed, 4))
+    write_json(folder / "results.json", results)
 
     print(f"\n{metric}, mean and standard error of {args.eval_episodes} episodes")
-    for phase, title in titles.items():
-        print("{:10} {score:7.3f} +- {stderr:.3f}".format(title, **results[phase]))
-    if args.env in PUBLISHED and args.task in (None, "push"):
-        print("the paper's main method: seen {}, unseen {}".format(*PUBLISHED[args.env]))
+    for name in tested:
+        print("{:10} {score:7.3f} +- {stderr:.3f}".format(TESTED[name], **results[name]))
+    try:  # whatever goes wrong with a picture, the results are safe
+        plot_curve(folder, metric)
+        record_episode(agent, phase, folder / "episode.gif")  # of the last phase: unseen actions
+    except Exception as e:
+        print(f"note: a picture is missing: {type(e).__name__}: {e}")
     print(f"curve, episode, metrics and checkpoints: {folder}")
     return results
 
@@ -1192,13 +1184,13 @@ def plot_curve(folder, metric):
 
     rows = np.genfromtxt(folder / "metrics.csv", delimiter=",", names=True, encoding="utf-8")
     rows = rows[~np.isnan(rows["train_score"])]
-    figure = Figure(figsize=(6, 4), layout="tight")
+    figure = Figure()
     axes = figure.subplots()
     for column in ("train_score", "valid_score"):
-        axes.plot(rows["step"] / 1e6, rows[column], marker=".", label=column)
-    axes.set(xlabel="million steps", ylabel=metric, ylim=(0, None))
-    axes.legend(frameon=False)
-    hvae.write(folder / "curve.png", lambda file: figure.savefig(file, format="png", dpi=120))
+        axes.plot(rows["step"], rows[column], label=column)
+    axes.set(xlabel="step", ylabel=metric)
+    axes.legend()
+    figure.savefig(folder / "curve.png")
 
 
 def record_episode(agent, phase, path):
@@ -1241,31 +1233,32 @@ class EvaluateArgs:
 
 def restrict_pool(options, module, table, pool, known):
     """The pool (m,) of unseen ids for an analysis of A.3; `known` (n,) were trained on."""
-    analyses = (options.min_angle_gap, options.min_embedding_distance, options.unseen_ratio)
-    if analyses == (None, None, None):
+    far, gap = options.min_embedding_distance, options.min_angle_gap
+    ratio = options.unseen_ratio
+    if (far, gap, ratio) == (None, None, None):
         return pool
     if np.isin(pool, known).any():
         raise UserError("the analyses choose among unseen actions")
-    for share in analyses[1:]:
+    for share in (far, ratio):
         if share is not None and not 0 <= share <= 1:
             raise UserError(f"{share} is no share between 0 and 1")
-    if options.min_embedding_distance is not None:
+    if far is not None:
         # Squared distance to the nearest representation of a training action. The published limits
         # fit the scale of one encoder; a share of the pool means the same for all of them.
         distances = torch.cdist(table[pool].double(), table[known].double())  # (m, n)
         squared = distances.amin(1).square().numpy()
-        pool = pool[squared >= np.quantile(squared, options.min_embedding_distance)]
-    if options.min_angle_gap is not None:
+        pool = pool[squared >= np.quantile(squared, far)]
+    if gap is not None:
         # Only tools that differ by so much from every training tool's angle.
         if not hasattr(module, "angle_gaps"):
             raise UserError("min_angle_gap: only the tools of CREATE have angles")
-        pool = pool[module.angle_gaps(pool, known) >= options.min_angle_gap]
-    if options.unseen_ratio is not None:
+        pool = pool[module.angle_gaps(pool, known) >= gap]
+    if ratio is not None:
         # A mixture as large as the smaller side, whatever the share, so that only the share differs
         # between two evaluations. The same mixture for all runs: seed 0.
         rng = np.random.default_rng(0)
         size = min(len(pool), len(known))
-        num_unseen = round(options.unseen_ratio * size)
+        num_unseen = round(ratio * size)
         unseen = rng.choice(pool, num_unseen, replace=False)
         pool = np.union1d(unseen, rng.choice(known, size - num_unseen, replace=False))
     return pool
@@ -1278,39 +1271,32 @@ def evaluate_run(options):
     folder = Path(options.run)
     best = load(folder / "best.pt")
     args = best["args"]
-    table = best["agent"]["table"]
-    phases, train_ids = action_phases(args)
-    phase = "train" if args.adapt else options.actions
-    pool, K = phases[phase]
-    K = K if options.num_available is None else options.num_available
     module = hvae.load_environment(args.env)
-    pool = restrict_pool(options, module, table, pool, phases["learn"][0])
-    most = len(with_no_op(pool, args))
-    if not 1 <= K <= most:
-        raise UserError(f"{K} available actions are asked for, but the pool has {most}")
+    phases, train_ids = action_phases(args)
+    part = "train" if args.adapt else options.actions
+    pool, K = phases[part]
+    pool = restrict_pool(options, module, best["agent"]["table"], pool, phases["learn"][0])
+    if options.num_available is not None:
+        K = options.num_available
+    phase = (pool, K)
+    check_number(phase, args)
 
     # The policy as it was trained, but with other actions: that is all of Algorithm 2.
     stream = (args.seed, 5)
-    envs, _ = make_envs(args, (pool, K), 1, stream)
-    agent = Agent(envs, table.numpy(), train_ids, args)
+    envs, _ = make_envs(args, phase, 1, stream)
+    agent = Agent(envs, best["agent"]["table"].numpy(), train_ids, args)
     envs.close()
     put(best, folder, agent=agent)
-    result = evaluate(agent, (pool, K), options.episodes, stream)
-    title = "adapted to" if args.adapt else options.actions
-    print(f"{title}: {K} of {most} actions available, {options.episodes} episodes")
+    result = evaluate(agent, phase, options.episodes, stream)
+    most = len(with_no_op(pool, args))
+    print(f"{part}: {K} of {most} actions available, {options.episodes} episodes")
     print(module.METRIC + " {score:.4f} +- {stderr:.4f}".format(**result))
-
     if options.save:
         # `best_step` tells which checkpoint was scored: an unfinished run may still find a better.
         row = dict(vars(options), num_available=K, pool_size=len(pool), **result)
-        row["best_step"] = best["step"]
-        with open(folder / "evaluations.csv", "a", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
-            if file.tell() == 0:
-                writer.writeheader()
-            writer.writerow(row)
+        append_row(folder / "evaluations.csv", row | {"best_step": best["step"]})
     if options.gif:
-        record_episode(agent, (pool, K), Path(options.gif))
+        record_episode(agent, phase, Path(options.gif))
         print(f"episode: {options.gif}")
     return result
 
@@ -1345,7 +1331,3 @@ if __name__ == "__main__":
         main(sys.argv[1:])
     except UserError as e:  # a mistake of the user's; one of the program's keeps its traceback
         raise SystemExit(f"error: {e}") from None
-    except OSError as e:
-        if e.errno not in (errno.ENOSPC, errno.EACCES):
-            raise
-        raise SystemExit(f"error: {e.strerror}: {e.filename or 'the run'}") from None
