@@ -5,16 +5,9 @@ available tools and a place for it, so that the red target ball reaches the gree
 twelve tasks and 2,111 tools (one, the no-op, does nothing), and 6,248 more for the Full Split and
 the analyses. What a tool does is told by a probe ball that is launched at it (action observations).
 
-    python create_env.py --task push     # the best of 400 random episodes as a GIF, beside it what
-                                         # the policy sees (--tries 1: a typical one)
-    python create_env.py --play          # place the tools yourself: mouse and space
-    python create_env.py --play --tools Fan Funnel    # with tools of your choice
-    python create_env.py --all-tasks     # Figure 7: all tasks on one sheet
-    python create_env.py --show-tools    # four tools of each class
-    python create_env.py --show-probe --tools Cannon  # probe-ball trajectories over three tools
-
-The file begins with tables, of the tools, their splits and the tasks. Then come the physics, the
-picture and the environment made of both, and last the probe ball and pictures for people.
+    python create_env.py --task push                # a GIF of the best of 400 random episodes
+    python create_env.py --play --tools Fan Funnel  # place tools of these classes by mouse
+    python create_env.py --sheet tasks              # Figure 7; others: tools, probe
 
 Paper map
     A.3 actions              KINDS, TOOLS           A.3 state        CreateEnv._observe(), draw()
@@ -22,15 +15,15 @@ Paper map
     A.3 action observations  action_observations()  B (labels)       action_labels()
     C.1, Figure 7            TASKS                  C.3              subgoal_reward=False
 
-Two marks name what the appendix does not: [code] is the authors' released implementation, used
-where the appendix is silent; [here] is a choice of this repository, with its reason. The authors
-also released CREATE alone, as a package; where that differs from [code], it is named.
+[code] marks the authors' released implementation, used where the appendix is silent; [here] marks a
+choice of this repository, with its reason. The authors also released CREATE alone, as a package;
+where that differs from [code], it is named.
 
 Units: the world is a square of 84 x 84 units, one unit per pixel of the observation, x to the
 right, y up, origin in the lower left corner. "norm" means agent coordinates in [-1, 1]:
 unit = (norm + 1) 42. Angles are degrees counter-clockwise in the tables, radians in the physics.
 
-KINDS and TASKS are edited in this file. A task of your own is an entry of TASKS:
+A task of your own is one more entry of TASKS, for instance right after the table:
 
     TASKS["gap"] = Task(
         target=ball("Target", -0.6, 0.6),
@@ -39,21 +32,19 @@ KINDS and TASKS are edited in this file. A task of your own is an entry of TASKS
         shifts={"target": (0.1, 0.0)},  # at every reset its x moves by U(-0.1, 0.1), its y stays
     )
 
-A tool class of your own is one line of KINDS. Its tools get the ids after all others:
+A tool class of your own is an entry of OWN_KINDS. Its tools get the ids after all others:
 
-    "Octagon": Kind("polygon", ORANGE, sides=8, turn=45, vary=SOLIDS),
+    OWN_KINDS = {"Octagon": Kind("polygon", ORANGE, sides=8, turn=45, vary=SOLIDS)}
 
-Every split divides them 2:1:1 separately, so that no other tool changes its part. But
-`engineered_representations` gets one more column and new standardised numbers for every tool. What
-a class does to a ball is a contact rule (`make_space`). Note: pymunk prints an exception raised in
-a contact rule and goes on without the rule, so watch stderr.
+Every split divides them 2:1:1 separately, so that no other tool changes its part; but
+`engineered_representations` gets a column more and other standardised numbers. What a class does to
+a ball is a contact rule (`make_space`). pymunk prints an exception that a rule raises and goes on.
 """
 
-import copy
 import io
 import multiprocessing
-import operator
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -70,8 +61,6 @@ from gymnasium.vector import AutoresetMode
 from PIL import Image, ImageDraw, ImageFont
 from pymunk import Vec2d
 from tqdm import tqdm
-
-# ---- constants ----
 
 WORLD = 84.0  # A.3: the screen is 84 x 84; [code] physics units are its pixels
 GRAVITY = (0.0, -2.0)  # [code] units/s^2
@@ -91,8 +80,8 @@ LAMBDA_OVERLAP = -0.01  # Eq. 3
 
 MIN_TOOL_GAP = 0.3  # [code] norm: tool centres this close "overlap"
 # A.3 "no moving objects" [code]: an action is still if at its end no body's centre is faster than
-# this; a plank turning on its pivot counts as still. The second still action ends the episode, even
-# if others lie between: after the first one the agent can set things going again.
+# this. The second still action ends the episode, even if others lie between: after the first one
+# the agent can set things going again.
 STILL_SPEED = 0.05  # units/s
 STILL_ACTIONS = 2
 HIT_DISTANCE = 0.03  # [code] share of the screen's diagonal: moved this far, the target is hit
@@ -103,15 +92,15 @@ BALL_MASS = 10.0  # [code]
 PLANK_MASS = 10.0  # [code] levers and see-saws ...
 PLANK_MOMENT = 10_000.0  # [code] ... are very sluggish
 LADDER_LEAN = 4.0  # [code] a ladder multiplies the sideways part of its motion by this
-VESSEL_ELASTICITY = 0.5  # [code] funnels and buckets; not one of their parameters
+VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; no feature of them
 
 METRIC = "success"  # the goal was reached in the episode (0 or 1)
 MODALITIES = ("xy", "state", "video")  # B: (x, y) of the ball is the default
 SPLITS = ("default", "random", "full", "analysis")  # of `split_actions`, the default first
 NO_OP = 0  # id of the no-operation action
 # For hvae.py: it models first states as (x - centre) / half_width and moves between states as
-# dx / step. Its decoder's smallest standard deviation is exp(-4 / 2) = 0.135 of a step, here half a
-# pixel, because [here] a step is 4 of 84 pixels.
+# dx / step. `step` is the unit of motion, 4 pixels: [here] the finest deviation of its decoder,
+# exp(-4 / 2) = .135 step, is then about half a pixel.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -125,7 +114,7 @@ SENSORS = (GOAL, CANNON, FAN, BELT, LADDER)
 
 
 class Tool(NamedTuple):
-    """One tool, or one object of a level. Parameters that its class does not use are 0."""
+    """One tool, or one object of a level. What its class does not use keeps its default."""
 
     kind: str  # its class, a key of KINDS
     elasticity: float = 0.0
@@ -140,24 +129,17 @@ class Tool(NamedTuple):
     friction: float = 1.0  # Coulomb friction: that of the contact is the product of both objects'
 
 
-class Paint(NamedTuple):
-    """A colour as the policy sees it, a grey of 0..255, and as people see it."""
-
-    grey: int
-    colour: str
-
-
 class Kind(NamedTuple):
     """Everything that holds for one class of tools, or of level objects."""
 
-    shape: str  # how it is built and drawn: "disc", "segment", "polygon", "box" or "plank"
-    paint: Paint
+    shape: str  # how it is built and drawn: "disc", "segment", "polygon" or "box"
+    colour: str  # as people see it; the policy sees the grey that Pillow makes of it
     contact: int = PLAIN
     sides: int = 0  # of polygons
     radius: float = 1.0  # units: half the thickness of segments
     # Degrees: angles stay below it, because the shape is the same again after this turn. See-saws
     # have limits in place of angles: [code] below 60 with a weight, below 90 without.
-    turn: int = 0
+    turn: int = 360
     # The tools of the class: the values of each parameter. The first parameter varies slowest from
     # id to id. Level objects have none.
     vary: dict[str, Sequence] = {}
@@ -172,7 +154,7 @@ LIMITS = range(FIRST_LIMIT, 90, COARSE_STEP)
 SOFT = (0.1, 0.3, 0.5)  # elasticities
 BOUNCY = (0.8, 1.0, 1.2)
 LENGTHS = (6, 10, 14, 18, 22)
-PLANKS = (12, 14, 16, 18, 20)
+PLANK_LENGTHS = (12, 14, 16, 18, 20)
 # A damping of 1 does nothing; it is among the features of ramps (`engineered_representations`).
 RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)}
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
@@ -182,9 +164,9 @@ BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. Planks and ball tools have no friction: [code] forgets to set it.
-HINGED = {"size": PLANKS, "max_angle": LIMITS, "damping": (1.0, 1.05, 1.1), "friction": (0,)}
-WEIGHTED = {"size": PLANKS, "max_angle": LIMITS, "left_up": (True, False), "mass": (2, 6, 10, 14)}
-WEIGHTED |= {"damping": (1.0,), "friction": (0,)}
+HINGED = {"size": PLANK_LENGTHS, "max_angle": LIMITS, "damping": (1.0, 1.05, 1.1), "friction": (0,)}
+WEIGHTED = {"size": PLANK_LENGTHS, "max_angle": LIMITS, "left_up": (True, False)}
+WEIGHTED |= {"mass": (2, 6, 10, 14), "damping": (1.0,), "friction": (0,)}
 DAMPINGS = [round(1 + k / 100, 2) for k in range(11)]
 LEVERS = {"size": (6, 12, 18, 24, 30), "damping": DAMPINGS, "friction": (0,)}
 CANNONS = {"angle": ANGLES, "force": range(60, 121, 10)}
@@ -194,19 +176,20 @@ BALLS = {"elasticity": (0.1, 0.2, 0.3, 0.4, 0.5), "size": (3, 5, 7, 9), "frictio
 BOUNCY_BALLS = {"elasticity": (0.8, 0.9, 1.0, 1.1, 1.2), "size": (3, 5, 7, 9), "friction": (0,)}
 BELTS = {"size": range(6, 25, 2), "speed": (1, 2, 3, 4, 5, 6, -1, -2, -3, -4, -5, -6)}
 
-# Greys of the pictures that [code] shows to the policy, its colours or near them for people.
-ORANGE = Paint(159, "#fa8535")
-BLUE = Paint(78, "#2f93bd")
-WOOD = Paint(168, "#e0a35c")
-RED = Paint(107, "#c8463b")
-GREEN = Paint(191, "#5fd32a")
-STEEL = Paint(118, "#4682b4")
+# Colours whose greys (0.299 R + 0.587 G + 0.114 B) are those that [code] shows to the policy.
+ORANGE = "#fa8535"
+BLUE = "#086788"
+WOOD = "#fa9149"
+GREEN = "#7cfd2e"
+STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
     "No-op": Kind("disc", GREEN, GOAL),  # never drawn or placed; see NO_OP_RADIUS
+    # The tools, in the order of their ids: learned tables and runs rely on it. Down to the bucket
+    # they are those of the Default Split.
     "Ramp": Kind("segment", ORANGE, turn=180, vary=RAMPS),
-    "Trampoline": Kind("segment", Paint(99, "#3d5a98"), turn=180, vary=TRAMPOLINES),
+    "Trampoline": Kind("segment", "#47659f", turn=180, vary=TRAMPOLINES),
     "Triangle": Kind("polygon", ORANGE, sides=3, turn=120, vary=SOLIDS),
     "Bouncy Triangle": Kind("polygon", BLUE, sides=3, turn=120, vary=BOUNCERS),
     "Square": Kind("polygon", ORANGE, sides=4, turn=90, vary=SOLIDS | NO_BOX),
@@ -215,47 +198,46 @@ KINDS = {
     "Bouncy Pentagon": Kind("polygon", BLUE, sides=5, turn=72, vary=BOUNCERS),
     "Hexagon": Kind("polygon", ORANGE, sides=6, turn=60, vary=SOLIDS),
     "Bouncy Hexagon": Kind("polygon", BLUE, sides=6, turn=60, vary=BOUNCERS),
-    "Hinged See-saw": Kind("plank", WOOD, PLANK, turn=90, vary=HINGED),
-    "See-saw": Kind("plank", WOOD, PLANK, turn=60, vary=WEIGHTED),
-    "Cannon": Kind("box", RED, CANNON, turn=360, vary=CANNONS),
-    "Fan": Kind("box", Paint(117, "#3f7cac"), FAN, turn=360, vary=FANS),
-    "Funnel": Kind("polygon", Paint(146, "#8d99ae"), FUNNEL, sides=3,
-                   turn=360, vary=VESSELS),
-    "Bucket": Kind("polygon", Paint(136, "#b5651d"), BUCKET, sides=4,
-                   turn=360, vary=VESSELS),
+    "Hinged See-saw": Kind("segment", WOOD, PLANK, radius=0, turn=90, vary=HINGED),
+    "See-saw": Kind("segment", WOOD, PLANK, radius=0, turn=60, vary=WEIGHTED),
+    "Cannon": Kind("box", "#c7463b", CANNON, vary=CANNONS),
+    "Fan": Kind("box", "#3f85ad", FAN, vary=FANS),
+    "Funnel": Kind("polygon", "#8793a8", FUNNEL, sides=3, vary=VESSELS),
+    "Bucket": Kind("polygon", "#cb782a", BUCKET, sides=4, vary=VESSELS),
     "Ball": Kind("disc", ORANGE, vary=BALLS),
     "Bouncy Ball": Kind("disc", BLUE, vary=BOUNCY_BALLS),
-    "Lever": Kind("plank", WOOD, PLANK, vary=LEVERS),
-    "Conveyor Belt": Kind("segment", Paint(121, "#6a6d8a"), BELT, vary=BELTS),
-    # level objects
-    "Target": Kind("disc", Paint(138, "#f45b69"), MOVING),
-    "Basketball": Kind("disc", Paint(132, "#e8772e"), MOVING),
-    "Marker": Kind("disc", Paint(163, "#79addc"), MOVING),
+    "Lever": Kind("segment", WOOD, PLANK, radius=0, vary=LEVERS),
+    "Conveyor Belt": Kind("segment", "#737696", BELT, vary=BELTS),
+    # Level objects
+    "Target": Kind("disc", "#f45b69", MOVING),
+    "Basketball": Kind("disc", "#da6a26", MOVING),
+    "Marker": Kind("disc", "#79addc", MOVING),
     "Goal ball": Kind("disc", GREEN, MOVING),
-    "Heavy ball": Kind("disc", Paint(0, "#4b4d62"), MOVING),
-    "Box": Kind("box", Paint(131, "#c69c6d"), MOVING),
+    "Heavy ball": Kind("disc", "#000000", MOVING),
+    "Box": Kind("box", "#a87b4c", MOVING),
     "Goal star": Kind("polygon", GREEN, GOAL, sides=5),
-    "Basket": Kind("box", Paint(188, "#e07a5f"), GOAL),
-    "Subgoal": Kind("disc", Paint(233, "#d3feb9"), GOAL),
-    "Thin line": Kind("segment", STEEL, radius=0.0),  # [code] thickness 1
+    "Basket": Kind("box", "#f2a98c", GOAL),
+    "Subgoal": Kind("disc", "#d3feb9", GOAL),
+    "Thin line": Kind("segment", STEEL, radius=0),  # [code] thickness 1
     "Line": Kind("segment", STEEL),  # [code] thickness 2 and 2.5
-    "Boundary": Kind("segment", Paint(193, "#b0c4de")),
-    "Ladder": Kind("segment", Paint(163, "#d9a877"), LADDER),
+    "Boundary": Kind("segment", "#b0c4de"),
+    "Ladder": Kind("segment", "#cc9a64", LADDER),
 }
+OWN_KINDS = {}  # tool classes of your own, see the docstring
 
-# The order of the ids: learned tables and runs rely on it. Those of the Default Split come first.
-ID_ORDER = (
-    "Ramp", "Trampoline", "Triangle", "Bouncy Triangle", "Square", "Bouncy Square", "Pentagon",
-    "Bouncy Pentagon", "Hexagon", "Bouncy Hexagon", "Hinged See-saw", "See-saw", "Cannon", "Fan",
-    "Funnel", "Bucket", "Ball", "Bouncy Ball", "Lever", "Conveyor Belt")
 # Table 1: the classes of the Full Split. See-saws are of two kinds, with and without a weight.
 TABLE_1_TRAIN = (
     "Ramp", "Trampoline", "Ball", "Bouncy Ball", "Hinged See-saw", "See-saw", "Cannon", "Bucket")
 TABLE_1_TEST = ("Triangle", "Bouncy Triangle", "Lever", "Fan", "Conveyor Belt", "Funnel")
 # fmt: on
 TABLE_1 = TABLE_1_TRAIN + TABLE_1_TEST
-FINE_KINDS = [name for name in ID_ORDER if name in TABLE_1 and KINDS[name].turn]  # [code] analyses
-OWN_KINDS = [name for name, kind in KINDS.items() if kind.vary and name not in ID_ORDER]
+
+# Your own classes join after the paper's, so that no id of the paper's tools changes.
+PAPER_KINDS = [name for name, kind in KINDS.items() if kind.vary]
+KINDS |= OWN_KINDS
+# [code] The classes of the analyses: those of Table 1 that have angles or limits.
+ANGULAR = ("angle", "max_angle")
+FINE_KINDS = [name for name in PAPER_KINDS if name in TABLE_1 and KINDS[name].vary.keys() & ANGULAR]
 
 
 def _tools_of(name: str, step: int = COARSE_STEP) -> list[Tool]:
@@ -264,11 +246,11 @@ def _tools_of(name: str, step: int = COARSE_STEP) -> list[Tool]:
     # are only 12 apart. [code] keeps them, and needs them for its 2,111; [here] as [code].
     kind = KINDS[name]
     choices = dict(kind.vary)
-    for parameter, values in kind.vary.items():
-        if parameter in ("angle", "max_angle"):
-            if step == FINE_STEP:
-                values = range(values.start, values.stop, step)
-            choices[parameter] = [value for value in values if value < kind.turn]
+    for parameter in kind.vary.keys() & ANGULAR:
+        values = kind.vary[parameter]
+        if step == FINE_STEP:
+            values = range(values.start, values.stop, step)
+        choices[parameter] = [value for value in values if value < kind.turn]
     rows = product(*choices.values())
     return [Tool(name, **dict(zip(choices, row, strict=True))) for row in rows]
 
@@ -277,9 +259,9 @@ def _all_tools() -> list[Tool]:
     """Every tool; its place in the list is its id."""
     # 0 is the no-op; 1..2,110 are the tools of the Default Split, with the no-op A.3's 2,111;
     # 2,111..2,325 are in the Full Split alone. appendix: lever, ball and belt are among the 2,111;
-    # [code] its 2,111 hold none of them; [here] as [code], because with them there were 2,326.
+    # [code] its 2,111 hold none of them; [here] as [code], because with them it would be 2,326.
     tools = [Tool("No-op")]
-    for name in ID_ORDER:
+    for name in PAPER_KINDS:
         tools += _tools_of(name)
     # Then the tools of the analyses, 3 degrees apart, without those that we have already.
     known = set(tools)
@@ -292,11 +274,12 @@ def _all_tools() -> list[Tool]:
 
 TOOLS = _all_tools()
 NUM_ACTIONS = len(TOOLS)  # 8,359 distinct tools over all splits
-# Arrays (NUM_ACTIONS,): the class; the angle in degrees (of see-saws the largest angle, 0 without
-# angles); is it one of the tools 15 degrees apart, not one that the analyses add?
+# Arrays (NUM_ACTIONS,): the class; the angle in degrees (of see-saws the limit, 0 without angles);
+# is it one of the tools 15 degrees apart (limits 5, 20, ...), not one that the analyses add?
 TOOL_KINDS = np.array([tool.kind for tool in TOOLS])
 TOOL_ANGLES = np.array([tool.max_angle or tool.angle for tool in TOOLS])
-IS_COARSE = np.isin(TOOL_ANGLES % COARSE_STEP, (0, FIRST_LIMIT)) | np.isin(TOOL_KINDS, OWN_KINDS)
+IS_COARSE = np.isin(TOOL_ANGLES % COARSE_STEP, (0, FIRST_LIMIT))
+IS_COARSE |= np.isin(TOOL_KINDS, list(OWN_KINDS))
 
 
 def action_labels() -> np.ndarray:
@@ -312,8 +295,7 @@ def engineered_representations() -> np.ndarray:
 
     One-hot of the 21 classes in alphabetical order, then elasticity, angle (rad), size, damping,
     largest angle (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are
-    15 degrees apart (over the 2,111 alone the speed would be constant). Classes of your own count
-    too: each is one more column and changes the standardised numbers.
+    15 degrees apart (over the 2,111 alone the speed would be constant).
     """
     # [code] has 23 classes (two of boxes) in an order that changes from run to run. [here] they are
     # sorted and without the boxes, because no split uses these. Friction is not among its numbers.
@@ -364,11 +346,10 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
     `seed` also draws which held-out tools are for validation, which for the test. The parts are
     disjoint. The no-op (id 0) is in none of them, because it is always available. The paper's
-    totals include it: 2,110 + 1, 1,737 + 2 (counted twice), training 761 + 1. Left out: default and
-    random have no balls, bouncy balls, levers or belts; full has no 4- to 6-sided polygons;
-    analysis has neither, and its training see-saws have the limits 5, 35 and 65. A class of your
-    own is in every split, 2:1:1 by its angles (without angles by the first parameter that it
-    varies). ValueError for an unknown split.
+    totals count it: 2,111 = 2,110 + 1 (default), 762 = 761 + 1 (analysis, training), 1,739 =
+    1,737 + 2 (full, once in training and once held out). Left out: default and random have no
+    balls, bouncy balls, levers or belts; full has no 4- to 6-sided polygons; analysis has neither.
+    A class of your own is in every split, half of the values of its first parameter in training.
     """
     if split not in SPLITS:
         raise ValueError(f"unknown split {split!r}; allowed: {', '.join(SPLITS)}")
@@ -384,7 +365,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         # appendix: 7,566 tools, "at least 15 degrees" between the 762 training tools; [code] 7,555
         # and the no-op, 30 degrees. [here] as [code]: only 30 degrees give 762, 7,566 is a slip.
         pool = np.isin(TOOL_KINDS, FINE_KINDS)
-        train = pool & np.isin(TOOL_ANGLES % 30, (0, FIRST_LIMIT))  # limits start at 5
+        train = pool & np.isin(TOOL_ANGLES % 30, (0, FIRST_LIMIT))  # see-saws: limits 5, 35, 65
     else:
         for group, angles in TRAINING_ANGLES.items():
             members = IS_COARSE & np.isin(TOOL_KINDS, group)
@@ -396,12 +377,10 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     # A.3: "The validation set is obtained by randomly splitting the testing set into half."
     valid, test = _halves(rng, np.flatnonzero(pool & ~train))
 
-    # A class of your own is divided by itself, with its own random numbers, so that it moves no
-    # other tool from one part to another.
+    # A class of your own has its own random numbers, so that it moves no other tool.
     for name in OWN_KINDS:
         rng = np.random.default_rng([seed, *name.encode()])
-        vary = KINDS[name].vary
-        primary = "angle" if "angle" in vary else next(iter(vary))
+        primary = next(iter(KINDS[name].vary))
         values = np.array([getattr(tool, primary) for tool in TOOLS])
         members = TOOL_KINDS == name
         train_values, _ = _halves(rng, values[members])
@@ -431,8 +410,7 @@ def angle_gaps(action_ids: Sequence[int], train_ids: Sequence[int]) -> np.ndarra
     """Degrees to the nearest training tool of the same class, float64 (len(action_ids),).
 
     Angles wrap at the class's full turn (a ramp at 177 is 3 degrees from one at 0), see-saw limits
-    do not. In a class without angles the gap is 0. A tool whose class has no training tool is
-    infinitely far. ValueError for bad ids.
+    do not. 0 in a class without angles, infinity without a training tool. ValueError: bad ids.
     """
     # [code] compares with all classes at once and without wrapping (345 is 345 away from 0). [here]
     # class by class, because 15 degrees of a fan are not 15 degrees of a ramp.
@@ -491,11 +469,6 @@ def line(x, y, length, angle=0, shift="", kind="Thin line") -> Item:
     return item(kind, x, y, shift, elasticity=0.5, angle=angle, size=length)
 
 
-def mirrored(one: Item) -> Item:
-    """The object on the other side of the level; for shapes that equal their mirror image."""
-    return one._replace(tool=one.tool._replace(angle=-one.tool.angle), x=-one.x)
-
-
 # The same with some parameters given: star(x, y), ladder(x, y, size=20), ball(kind, x, y).
 ball = partial(item, elasticity=1.0, size=BALL_RADIUS, mass=BALL_MASS)
 star = partial(item, "Goal star", angle=90, size=4)  # the goal of most tasks
@@ -508,20 +481,27 @@ LEFT_WALL = line(-1, 0, 90, 90, kind="Boundary")
 CEILING = line(0, 1, 90, kind="Boundary")
 ROOM = (RIGHT_WALL, LEFT_WALL, CEILING)
 
-# All numbers of the levels are those of the published task files [code]: positions in norm, lengths
-# and radii in units, angles in degrees.
+
+def chamber(sign: int) -> tuple[Item, ...]:
+    """A chamber of the task "funnel": the left one (sign 1) or its mirror image (-1)."""
+    return (
+        line(-0.56 * sign, -0.99, 35.5),
+        line(-0.88 * sign, -0.16, 10),  # the lid, to both sides of the funnel
+        line(-0.257 * sign, -0.16, 10),
+        line(-0.99 * sign, -0.7, 45, 90 * sign),
+        line(-0.15 * sign, -0.7, 45, 90 * sign),
+        item("Funnel", -0.6 * sign, -0.15, angle=-45 * sign, size=8),
+    )
+
+
+# [code] All numbers of the levels: positions in norm, lengths and radii in units, degrees.
 # fmt: off
-# One of the two chambers of the task "funnel": floor, lid to both sides of the funnel, walls.
-CHAMBER = (
-    line(-0.56, -0.99, 35.5), line(-0.88, -0.16, 10), line(-0.257, -0.16, 10),
-    line(-0.99, -0.7, 45, 90), line(-0.15, -0.7, 45, 90),
-    item("Funnel", -0.6, -0.15, angle=-45, size=8))
 TASKS = {
     # The first three are in the main paper, the other nine in Figure 8.
     # The marker falls at the right: bend its way, so that it knocks the target to the star.
     "push": Task(
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
-        items=(line(0.1, -0.25, 16, 0, "target"), line(-0.7, -0.75, 16, 0, "goal")),
+        items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
     # The marker rolls down, has to pass a stack of boxes and the subgoal, and to come back below.
     "obstacle": Task(
@@ -547,7 +527,7 @@ TASKS = {
     "navigate": Task(
         marker=ball("Marker", -0.6, 0.75), target=ball("Target", 0.1, -0.24),
         goal=star(-0.65, -0.59), shifts={"target": 0.1, "goal": 0.2},
-        items=(line(0.1, -0.35, 16, 0, "target"), line(-0.65, -0.7, 16, 0, "goal"),
+        items=(line(0.1, -0.35, 16, shift="target"), line(-0.65, -0.7, 16, shift="goal"),
                line(-0.5, 0.1, 40))),
     # Two belts carry the ball to the left; under the floor it has to come back to the right.
     "belt": Task(
@@ -568,14 +548,13 @@ TASKS = {
     "cannon": Task(
         marker=ball("Marker", 0.8, 0.75), target=ball("Target", 0.4, 0.11), goal=star(-0.7, -0.1),
         items=(line(-0.1, 0.35, 55, 90), item("Cannon", -0.1, -0.8, angle=110, force=140),
-               line(0.4, 0.0, 8, 0, "target")),
+               line(0.4, 0.0, 8, shift="target")),
         shifts={"marker": 0.1, "target": 0.05, "goal": 0.05},
         walls=(RIGHT_WALL, CEILING), marker_must_hit=True),
     # Two balls fall on two sides of a wall: make them meet.
     "collide": Task(
         target=ball("Target", 0.6, 0.7), goal=ball("Goal ball", -0.6, 0.7),
-        items=(line(0.0, 0.25, 35, 90),),
-        shifts={"target": 0.1, "goal": 0.1}, walls=ROOM),
+        items=(line(0.0, 0.25, 35, 90),), shifts={"target": 0.1, "goal": 0.1}, walls=ROOM),
     # The goal is a ball that bounces on a trampoline.
     "moving": Task(
         target=ball("Target", 0.6, 0.75), goal=ball("Goal ball", -0.7, 0.0),
@@ -585,7 +564,7 @@ TASKS = {
     "ladder": Task(
         marker=ball("Marker", 0.7, 0.75), target=ball("Target", 0.35, -0.09),
         goal=star(-0.75, -0.09), shifts={"target": 0.1, "goal": 0.2},
-        items=(line(0.35, -0.2, 5, 0, "target"), line(-0.75, -0.2, 5, 0, "goal"),
+        items=(line(0.35, -0.2, 5, shift="target"), line(-0.75, -0.2, 5, shift="goal"),
                ladder(-0.1, -0.1, size=20))),
     # Up three ladders, as up stairs, into the basket.
     "basket": Task(
@@ -598,8 +577,7 @@ TASKS = {
     "funnel": Task(
         # [code] from (0, 0.9) both coordinates are shifted by U(-0.2, 0.05): the same places
         target=ball("Target", -0.075, 0.825), goal=star(-0.28, -0.8),
-        items=(*CHAMBER, *map(mirrored, CHAMBER)),
-        shifts={"target": 0.125}, goal_on_either_side=True),
+        items=chamber(1) + chamber(-1), shifts={"target": 0.125}, goal_on_either_side=True),
 }
 # fmt: on
 
@@ -616,32 +594,28 @@ def to_units(norm):
     return (norm + 1.0) * WORLD / 2
 
 
-# (along, across) units; other boxes are squares. [code] swaps two arguments, so a cannon's contact
-# box never turns with the aim. [here] it turns, as drawn. Where a caught ball is put and its speed
-# are unchanged; only where a cannon catches differs.
+# (along, across) units; other boxes are squares. [code] swaps two arguments, so that a cannon's
+# contact box never turns. [here] it turns with the aim. This changes only where it catches a ball,
+# not where or how fast it shoots.
 BOX_SIZE = {"Cannon": (10.0, 7.3), "Fan": (6.7, 10.0)}
-MUZZLE = (5.0, 3.65)  # [code] units: times (cos, sin) of the aim it is where a caught ball is put
-FIRST_CORNER = {"Funnel": 30, "Bucket": 45}  # [code] degrees at tool angle 0
+MUZZLE = (5.0, 3.65)  # [code] units: times (cos, sin) of the aim, where balls are shot from
+LAST_CORNER = {"Funnel": 30, "Bucket": 45}  # [code] degrees: where it is at tool angle 0
 # The no-op has nothing to touch. For the probe ball alone it is a disc to fly through: [code] a
 # ball is near within 0.1 sqrt(8) norm of the place, 11.9 units.
 NO_OP_RADIUS = 0.1 * sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
 def outline(tool: Tool) -> list[Vec2d]:
-    """Corners of an object, or ends of its line, around its place; discs have none.
-
-    Where rules and pictures need a corner by its role: funnel 0 and 2 are the mouth, 1 the nozzle;
-    bucket 0 and 3 are the opening.
-    """
+    """Corners of an object, or ends of its line, around its place; discs have none."""
     kind = KINDS[tool.kind]
     angle = radians(tool.angle)
-    if kind.shape in ("segment", "plank"):
+    if kind.shape == "segment":
         end = Vec2d.from_polar(tool.size / 2, angle + start_tilt(tool))
         return [-end, end]
-    if kind.shape == "polygon":  # counter-clockwise; the corner at `first` itself comes last
-        first = radians(tool.angle + FIRST_CORNER.get(tool.kind, 0))
+    if kind.shape == "polygon":  # counter-clockwise
+        last = radians(tool.angle + LAST_CORNER.get(tool.kind, 0))
         turn = 2 * pi / kind.sides
-        return [Vec2d.from_polar(tool.size, first + turn * k) for k in range(1, kind.sides + 1)]
+        return [Vec2d.from_polar(tool.size, last + turn * k) for k in range(1, kind.sides + 1)]
     if kind.shape == "box":
         along, across = BOX_SIZE.get(tool.kind, (tool.size, tool.size))
         signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
@@ -664,24 +638,22 @@ def weight_place(tool: Tool) -> Vec2d:
 
 
 class SceneObject:
-    """One object at a place (units). Its `parts` are still to be added to a space."""
+    """One object at a place (units). Its `parts` are still to be added to the space."""
 
     def __init__(self, tool: Tool, place: Vec2d, static_body: pymunk.Body):
-        """`static_body`: that of the space which the object is for."""
         kind = KINDS[tool.kind]
         self.tool = tool
         self.kind = kind
         self.place = place  # where it is put
-        self.corners = [place + corner for corner in outline(tool)]
         self.waits_for = None  # the ball whose touch a goal, subgoal or marker awaits ...
         self.touched = False  # ... and whether it came
         self.held_by = None  # the bucket that has caught a ball
 
-        # Level balls, loose boxes and planks move: each has a body of its own, and its shape is
-        # given around that body's centre. All else, the tools Ball and Bouncy Ball too, is a part
-        # of the space's static body.
+        # Level balls, loose boxes and planks move: each has a body, and its shape is given around
+        # that body's centre. All else, the tools Ball and Bouncy Ball too, is a part of the space's
+        # static body, and its shape is given in the world.
         self.body = None
-        if kind.shape == "plank":
+        if kind.contact == PLANK:
             self.body = pymunk.Body(PLANK_MASS, PLANK_MOMENT)
         elif kind.contact == MOVING:
             divisor = 2 if kind.shape == "disc" else 6  # moment of a disc, of a square
@@ -689,16 +661,15 @@ class SceneObject:
         if self.body:
             self.body.position = place
         body = self.body or static_body
+        origin = Vec2d(0, 0) if self.body else place
 
         # The shape is what others collide with.
+        self.corners = [origin + corner for corner in outline(tool)]
         if kind.shape == "disc":
-            centre = (0.0, 0.0) if self.body else place
-            shape = pymunk.Circle(body, tool.size or NO_OP_RADIUS, centre)
+            shape = pymunk.Circle(body, tool.size or NO_OP_RADIUS, origin)
         elif kind.shape == "segment":
             shape = pymunk.Segment(body, *self.corners, kind.radius)
-        elif kind.shape == "plank":
-            shape = pymunk.Segment(body, *outline(tool), 0.0)
-        elif self.body:
+        elif self.body:  # a loose box
             shape = pymunk.Poly.create_box(body, (tool.size, tool.size))
         else:
             shape = pymunk.Poly(body, self.corners)
@@ -715,36 +686,28 @@ class SceneObject:
 
         # pymunk wants a body before what hangs on it.
         self.parts = [self.body] if self.body else []
-        if kind.shape == "plank":
+        if kind.contact == PLANK:
             self.parts += self._fixtures(static_body)
         self.parts.append(shape)
 
     def _fixtures(self, static_body: pymunk.Body) -> list:
         """What holds a plank at its pivot and limits its turn; the weight on its end, if any."""
         # [code] has a pin joint of length zero and a slide joint. [here] the joints that pymunk has
-        # for the purpose: with them the centre stays put. Over 800 launches per class the means and
-        # deviations of motion and angle agree with [code] to two decimals.
-        tool = self.tool
+        # for the purpose: with them the centre stays put. On average balls move as in [code].
         fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
-        if tool.max_angle:
+        if self.tool.max_angle:
             # The tilt at the start is part of the segment: the body starts at angle 0.
-            limit = radians(tool.max_angle)
-            tilt = start_tilt(tool)
+            limit = radians(self.tool.max_angle)
+            tilt = start_tilt(self.tool)
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
-        if tool.mass:
-            # The weight has no shape, so nothing collides with it; it is fixed to the plank [code].
-            weight = pymunk.Body(tool.mass, tool.mass)  # [code] mass and moment are one number
-            weight.position = self.place + weight_place(tool)
+        if self.tool.mass:
+            # [code] The weight has no shape, so nothing hits it; mass and moment are one number.
+            weight = pymunk.Body(self.tool.mass, self.tool.mass)
+            weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
             fixtures += [weight, pivot, pymunk.GearJoint(self.body, weight, 0.0, 1.0)]
         return fixtures
-
-    def pose(self) -> tuple[Vec2d, float]:
-        """Where it is now, and its angle (rad)."""
-        if self.body is None:
-            return self.place, 0.0
-        return self.body.position, self.body.angle
 
 
 # ---- the physics: what happens when two objects touch ----
@@ -755,7 +718,6 @@ class SceneObject:
 
 
 def _put_at_rest(body: pymunk.Body, position: tuple[float, float]) -> None:
-    """Put a body somewhere, at rest."""
     body.position = position
     body.velocity = (0.0, 0.0)
     body.force = (0.0, 0.0)
@@ -783,11 +745,10 @@ def _on_carrier(arbiter, space, data) -> None:
 def _on_cannon(arbiter, space, data) -> None:
     """A cannon shoots when contact begins; later steps of it would catch its own shot."""
     mover, cannon = (shape.owner for shape in arbiter.shapes)
-    if mover.held_by is not None:
-        return
     aim = radians(cannon.tool.angle)
-    _put_at_rest(mover.body, cannon.place + (MUZZLE[0] * cos(aim), MUZZLE[1] * sin(aim)))
-    mover.body.velocity = Vec2d.from_polar(cannon.tool.force / mover.body.mass, aim)
+    if mover.held_by is None:  # a bucket does not let go
+        _put_at_rest(mover.body, cannon.place + (MUZZLE[0] * cos(aim), MUZZLE[1] * sin(aim)))
+        mover.body.velocity = Vec2d.from_polar(cannon.tool.force / mover.body.mass, aim)
 
 
 def _on_fan(arbiter, space, data) -> None:
@@ -813,8 +774,9 @@ def _on_bucket(arbiter, space, data) -> None:
     """What comes in by the opening stays in for good; from elsewhere a bucket is solid."""
     mover, holder = (shape.owner for shape in arbiter.shapes)
     if mover.held_by is None:
-        d0, d1, d2, d3 = (dist(mover.body.position, corner) for corner in holder.corners)
-        if max(d0, d3) < min(d1, d2):
+        gaps = (dist(mover.body.position, corner) for corner in holder.corners)
+        top_left, low_left, low_right, top_right = gaps  # as the corners are at tool angle 0
+        if max(top_left, top_right) < min(low_left, low_right):
             mover.held_by = holder
     if mover.held_by is holder:
         # [code] resets the position alone, so that the ball's speed grows without end, the package
@@ -853,9 +815,8 @@ def make_space() -> pymunk.Space:
 
 # ---- A.3 state: one set of flat shapes, in grey for the policy and in colour for people ----
 
-FINE = 3  # [here] drawn so many times too large and averaged, for soft edges and small moves
+ZOOM = 3  # [here] drawn so many times too large and averaged, for soft edges and small moves
 EDGE = 0.25  # [here] units: the dark edge that people see around every shape
-PAPER = "#fdfcf8"
 INK = "#3b3a44"
 
 
@@ -867,54 +828,47 @@ class Canvas:
     def __init__(self, size: int, in_colour: bool, units: float = WORLD):
         self.in_colour = in_colour
         self.units = units
-        self.scale = size * FINE / units  # fine pixels per unit
-        mode, paper = ("RGB", PAPER) if in_colour else ("L", 255)
-        self.image = Image.new(mode, (size * FINE, size * FINE), paper)
+        self.scale = size * ZOOM / units  # pixels per unit, before they are averaged
+        # In mode "L", grey, Pillow turns every colour it is given into its grey.
+        self.image = Image.new("RGB" if in_colour else "L", (size * ZOOM, size * ZOOM), "white")
         self.pen = ImageDraw.Draw(self.image)
 
-    def copy(self) -> "Canvas":
-        other = copy.copy(self)
-        other.image = self.image.copy()
-        other.pen = ImageDraw.Draw(other.image)
-        return other
-
-    def line(self, points, width: float, paint: Paint, edge: float = EDGE) -> None:
+    def stroke(self, points, width: float, colour: str) -> None:
         """A line with round ends and corners through points (units). Through one: a disc."""
-        if self.in_colour and edge:
-            self.line(points, width + 2 * edge, Paint(0, INK), edge=0)
-        ink = paint.colour if self.in_colour else paint.grey
         pixels = self._to_pixels(points)
         thick = max(1, round(width * self.scale))
         if len(pixels) > 1:
-            self.pen.line(pixels, ink, thick)
+            self.pen.line(pixels, colour, thick)
         if thick > 2:
             for x, y in pixels:
                 left = round(x - thick / 2)
                 top = round(y - thick / 2)
-                self.pen.ellipse((left, top, left + thick - 1, top + thick - 1), ink)
+                self.pen.ellipse((left, top, left + thick - 1, top + thick - 1), colour)
 
-    def disc(self, centre: Vec2d, radius: float, paint: Paint, edge: float = EDGE) -> None:
-        self.line([centre], 2 * radius, paint, edge)
-
-    def polygon(self, corners: list[Vec2d], paint: Paint) -> None:
+    def line(self, points, width: float, colour: str) -> None:
+        """The same; in colour with a dark edge."""
         if self.in_colour:
-            self.line([*corners, corners[0]], 2 * EDGE, Paint(0, INK), edge=0)
-        ink = paint.colour if self.in_colour else paint.grey
-        self.pen.polygon(self._to_pixels(corners), ink)
+            self.stroke(points, width + 2 * EDGE, INK)
+        self.stroke(points, width, colour)
+
+    def polygon(self, corners: list[Vec2d], colour: str) -> None:
+        if self.in_colour:
+            self.stroke([*corners, corners[0]], 2 * EDGE, INK)
+        self.pen.polygon(self._to_pixels(corners), colour)
 
     def _to_pixels(self, points) -> list:
-        # Pillow rounds to fine pixels: in the observation a ball moves in thirds of a unit.
+        # Pillow rounds to these pixels: in the observation a ball moves in thirds of a unit.
         return [(x * self.scale, (self.units - y) * self.scale) for x, y in points]
 
     def picture(self) -> np.ndarray:
         """uint8 (size, size) in grey, (size, size, 3) in colour."""
-        return np.array(self.image.reduce(FINE))
+        return np.array(self.image.reduce(ZOOM))
 
 
 def draw(canvas: Canvas, tool: Tool, place: Vec2d, angle: float = 0.0) -> None:
     """Draw an object: the shape that others collide with, and marks that show what it does."""
     kind = KINDS[tool.kind]
-    paint = kind.paint
+    colour = kind.colour
     half = tool.size / 2
     corners = [place + corner.rotated(angle) for corner in outline(tool)]
     aim = angle + radians(tool.angle)
@@ -923,57 +877,44 @@ def draw(canvas: Canvas, tool: Tool, place: Vec2d, angle: float = 0.0) -> None:
         """A point in the object's own frame, which is turned by its angle."""
         return place + Vec2d(along, across).rotated(aim)
 
-    # dark and light show in colour only: in grey they equal the shape, unseen by the policy.
-    dark = Paint(paint.grey, INK)
-    light = Paint(paint.grey, "#ffffff")
-    inside = Paint(255, "#eef1f6")
     match tool.kind:
         case "No-op":
             pass  # it has no picture
         case "Cannon":
-            canvas.polygon(corners, paint)
-            canvas.disc(at(-2.5), 1.8, dark)  # the wheel
-            canvas.polygon([at(4.6), at(1.6, 2.2), at(1.6, -2.2)], Paint(255, "#ffffff"))  # the aim
+            canvas.polygon(corners, colour)
+            canvas.polygon([at(4.6), at(1.6, 2.2), at(1.6, -2.2)], "white")  # where it shoots
         case "Fan":
-            canvas.line([*corners, corners[0]], 1.0, paint)
-            canvas.line([at(-1), at(3.35)], 1.0, paint)  # an arrow, where the wind goes
-            canvas.polygon([at(3.35), at(1.0, 2.0), at(1.0, -2.0)], paint)
+            canvas.line([*corners, corners[0]], 1.0, colour)
+            canvas.line([at(-1), at(3.35)], 1.0, colour)  # an arrow, where the wind goes
+            canvas.polygon([at(3.35), at(1.0, 2.0), at(1.0, -2.0)], colour)
         case "Funnel" | "Bucket":
-            canvas.polygon(corners, inside)
-            canvas.line(corners, 1.2, paint)  # open from the last corner to the first
+            canvas.polygon(corners, "white")
+            canvas.line(corners, 1.2, colour)  # open from the last corner to the first
         case "Basket":
-            canvas.line([*corners, corners[0]], 1.0, paint)
-        case "Goal star":
-            canvas.polygon(corners, light)  # the pentagon is what counts
-            canvas.polygon([corners[k] for k in (0, 2, 4, 1, 3)], paint)
-            canvas.disc(place, 1.4, paint, edge=0)
-        case "Trampoline":
-            canvas.line(corners, 2.0, paint)
-            canvas.line(corners, 0.4, light)
+            canvas.line([*corners, corners[0]], 1.0, colour)
+        case "Goal star" if canvas.in_colour:  # in grey the pentagon that balls have to touch
+            canvas.polygon([corners[k] for k in (0, 2, 4, 1, 3)], colour)
+            canvas.stroke([place], 2.8, colour)
         case "Ladder":
-            canvas.line(corners, 2.0, paint)
+            canvas.line(corners, 2.0, colour)
             for u in np.arange(1.0 - half, half, 2.0).tolist():
-                canvas.line([at(u, -1.0), at(u, 1.0)], 0.1, dark)
+                canvas.line([at(u, -1.0), at(u, 1.0)], 0.1, colour)
         case "Conveyor Belt":
-            canvas.line(corners, 2.0, paint)
+            canvas.line(corners, 2.0, colour)
             ahead = 1 if tool.speed > 0 else -1  # an arrow head shows where it runs to
             end = ahead * half
-            canvas.polygon([at(end + 2 * ahead), at(end, 1.9), at(end, -1.9)], paint)
+            canvas.polygon([at(end + 2 * ahead), at(end, 1.9), at(end, -1.9)], colour)
         case "See-saw" | "Hinged See-saw" | "Lever":
-            # A dark foot tells people a see-saw, which has a limit, from a lever.
-            foot = dark if tool.max_angle else light
-            canvas.polygon([place, place + (-2, -2), place + (2, -2)], foot)
-            canvas.line(corners, 1.0, paint)
+            canvas.polygon([place, place + (-2, -2), place + (2, -2)], colour)
+            canvas.line(corners, 1.0, colour)
             if tool.mass:
-                canvas.disc(at(*weight_place(tool)), 1.5, dark)
+                canvas.line([at(*weight_place(tool))], 3.0, colour)
         case _ if kind.shape == "disc":
-            canvas.disc(place, tool.size, paint)
-            if kind.contact == MOVING:  # a stripe shows how a ball spins
-                canvas.line([at(-0.7 * tool.size), at(0.7 * tool.size)], 0.1, dark)
+            canvas.line([place], 2 * tool.size, colour)
         case _ if kind.shape == "segment":
-            canvas.line(corners, max(2 * kind.radius, 1.0), paint)
+            canvas.line(corners, max(2 * kind.radius, 1.0), colour)
         case _:
-            canvas.polygon(corners, paint)
+            canvas.polygon(corners, colour)
 
 
 # ---- A.3 the environment ----
@@ -987,34 +928,25 @@ PICTURE_SIZE = 420  # [here] pixels, of the scene in colour
 class CreateEnv(gym.Env):
     """Place tools so that the target ball reaches the goal (appendix A.3).
 
-    ## Description
-    A 2-D world of 84 x 84 units with gravity and no floor. Every action places at most one tool,
-    then 40 physics steps (1.33 s) run. A placed tool stays for the rest of the episode.
+    Every action places at most one tool, which then stays; after it 40 physics steps (1.33 s) run.
 
     ## Action Space
     `Dict(choice=Discrete(K), position=Box(-1, 1, (2,), float32))`: a place in `available`, and
-    where to put the tool's centre (x to the right, y up, in norm). Choice 0 is always the no-op.
-    `step` also accepts positions outside of the Box, as an unclipped Gaussian policy makes them:
-    the tool is refused. `placement` tells what came of the last one: "placed", "waited", "outside",
-    "too close" or "blocked".
+    where to put the tool's centre (norm). Choice 0 is always the no-op. `step` also accepts
+    positions outside of the Box, as an unclipped Gaussian policy makes them: the tool is refused.
+    `placement` tells what came of it: "placed", "waited", "outside", "too close" or "blocked".
 
     ## Observation Space
-    | key       | space                              | meaning                                    |
-    |-----------|------------------------------------|--------------------------------------------|
-    | state     | Box(0, 255, (3, 84, 84), uint8)    | last 3 grey pictures, newest last          |
-    | available | Box(0, NUM_ACTIONS-1, (K,), int64) | the available tools of this episode        |
-
-    After reset the two older pictures are black. `available` is the no-op and K - 1 tools, drawn
-    without replacement from the pool at every reset; or, if K - 1 is its size, all in sorted order.
+    `state`, Box(0, 255, (3, 84, 84), uint8): the last 3 grey pictures, newest last; after reset the
+    two older ones are black. `available`, Box(0, NUM_ACTIONS - 1, (K,), int64): the no-op and
+    K - 1 tools, drawn without replacement from the pool at every reset; if the pool has no more,
+    all in sorted order.
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a tool that is refused.
-    In tasks with a marker (blue) the goal counts only at the target hit or later. That
-    is the first time the target (red) is more than 3.56 units from its start, whatever moved it: +1
-    (obstacle: +2). In obstacle and cannon the marker must also have touched it.
-
-    ## Starting State
-    The task's level with its random shifts; everything at rest.
+    In tasks with a marker (blue) the goal counts only at the target hit or later. That is the first
+    time the target (red) is more than 3.56 units from its start, whatever moved it: +1 (obstacle:
+    +2). In obstacle and cannon the marker must also have touched it.
 
     ## Episode End
     Terminated: goal reached; target off the screen; marker off the screen before the target hit;
@@ -1022,9 +954,9 @@ class CreateEnv(gym.Env):
     actions (obstacle, belt 50; basket 40). On the last step `info` has `success`, 0.0 or 1.0.
 
     ## Arguments
-    `action_pool` ids (default: training split; the no-op may be among them), `num_available` K,
-    `task` one of `TASKS`, `subgoal_reward=False` pays neither subgoals nor target hit (C.3). What
-    does not exist of these, and bad actions, raise ValueError and change nothing.
+    `action_pool` ids (default: training split), `num_available` K, `task` of TASKS;
+    `subgoal_reward=False` pays neither subgoals nor target hit (C.3). What does not exist of these,
+    and bad actions, raise ValueError and change nothing.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
@@ -1033,8 +965,6 @@ class CreateEnv(gym.Env):
                  task="push", subgoal_reward=True):  # fmt: skip
         if task not in TASKS:
             raise ValueError(f"unknown task {task!r}; allowed: {', '.join(TASKS)}")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"unknown render_mode {render_mode!r}; allowed: None, 'rgb_array'")
         # The pool holds tools alone; the no-op is available beside whatever is drawn from it.
         ids = check_ids(split_actions()["train"] if action_pool is None else action_pool)
         self.action_pool = ids[ids != NO_OP]
@@ -1043,30 +973,26 @@ class CreateEnv(gym.Env):
         self.task = TASKS[task]
         self.subgoal_reward = subgoal_reward
         self.render_mode = render_mode
-        # What the agent sees, and what it may do.
         state = spaces.Box(0, 255, (NUM_FRAMES, 84, 84), np.uint8)
         available = spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64)
         self.observation_space = spaces.Dict(state=state, available=available)
         position = spaces.Box(-1, 1, (2,), np.float32)
         self.action_space = spaces.Dict(choice=spaces.Discrete(num_available), position=position)
         self._over = True  # no episode yet
-        self._pictures = []
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start an episode with newly drawn available tools; returns (observation, {})."""
-        # gymnasium refuses numpy's integers, so a seed is turned into one of Python.
-        super().reset(seed=None if seed is None else operator.index(seed))
+        super().reset(seed=seed)
 
         # Subsampling: every episode has its own few tools of the pool. If all of them are to be
-        # available, nothing is drawn and the order stays.
-        # [code] The Full Split's test draws a class, then a tool of it; [here] as in training,
-        # because the appendix names no other way.
+        # available, nothing is drawn. (Only for tests of the Full Split [code] draws a class first,
+        # then a tool of it; the appendix names no such way.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
         self.available = np.concatenate([[NO_OP], tools])  # (K,)
 
-        # Build the level. All objects are at rest, nothing has been placed.
+        # All objects are at rest, and nothing has been placed.
         self._build_level()
         self._actions = 0
         self._centres = []  # norm, of the tools placed so far
@@ -1079,7 +1005,7 @@ class CreateEnv(gym.Env):
         self._still = 0  # actions that ended without motion; it only grows
         self._over = False
 
-        # The first observation: the picture of the level after two black ones.
+        # The first observation is the picture of the level after two black ones.
         self._frames = np.zeros((NUM_FRAMES, 84, 84), np.uint8)
         observation = self._observe()
         self._pictures = []
@@ -1093,16 +1019,15 @@ class CreateEnv(gym.Env):
         # Objects that share a shift, as a ball and its shelf do, move together: one draw for all.
         self._shifts = {}
         for name, half_range in task.shifts.items():
-            half_ranges = np.broadcast_to(half_range, 2)  # of x and y
-            self._shifts[name] = self.np_random.uniform(-half_ranges, half_ranges)
+            self._shifts[name] = self.np_random.uniform(np.negative(half_range), half_range, 2)
 
         # The order is that of [code]. Contacts are solved in this order, so it is part of a level.
+        # Subgoals and walls are never shifted.
         self._space = make_space()
         self._objects = []
         self._marker = self._add(task.marker, "marker") if task.marker else None
         for one in task.items:
             self._add(one, one.shift)
-        # Subgoals are never shifted [code].
         self._subgoals = [self._add(item("Subgoal", x, y, size=3)) for x, y in task.subgoals]
         for wall in task.walls:
             self._add(wall)
@@ -1119,7 +1044,9 @@ class CreateEnv(gym.Env):
             self._marker.waits_for = self._target
         for subgoal in self._subgoals:
             subgoal.waits_for = self._marker or self._target
-        self._paint_backgrounds()
+
+        # The grey picture of all that stands still is kept; what moves is drawn on copies of it.
+        self._background = self._draw_objects(Canvas(84, in_colour=False), moving=False)
 
     def _add(self, one: Item, shift: str = "") -> SceneObject:
         dx, dy = self._shifts.get(shift, (0.0, 0.0))
@@ -1185,9 +1112,8 @@ class CreateEnv(gym.Env):
         self._space.add(*new.parts)
         self._objects.append(new)
         self._centres.append(position)
-        for canvas in self._backgrounds:
-            if new.body is None:
-                draw(canvas, new.tool, place)
+        if new.body is None:
+            draw(self._background, new.tool, place)
         return "placed"
 
     def _judge(self) -> tuple[bool, int, bool]:
@@ -1214,14 +1140,13 @@ class CreateEnv(gym.Env):
             self._objects.remove(subgoal)
             self._subgoals.remove(subgoal)
         if reached:
-            self._paint_backgrounds()
+            self._background = self._draw_objects(Canvas(84, in_colour=False), moving=False)
         return self._goal_hit, len(reached), hit_now
 
     def _pay(self, goal_reached: bool, subgoals_reached: int, hit_now: bool) -> float:
         """The reward, A.3 Equation 3: alive, goal, subgoals, target hit, invalid, overlap."""
-        # appendix: products of the bonus terms; [code] sums; [here] sums, since a product would pay
-        # nothing before the goal. [code] also takes 0.1 per placed tool from the goal's and every
-        # subgoal's reward, which Equation 3 does not have.
+        # appendix: products of the bonus terms, which would pay nothing before the goal. [code]
+        # sums and takes 0.1 per placed tool from the rewards of goal and subgoals. [here] sums.
         reward = LAMBDA_ALIVE + REFUSED.get(self.placement, 0.0)
         reward += goal_reached * LAMBDA_GOAL  # an indicator of Eq. 3 is True or False, 1 or 0
         # C.3 switches off the rewards of subgoals. The authors ran it in push too, which has none,
@@ -1236,8 +1161,9 @@ class CreateEnv(gym.Env):
         # A ball that is still needed has left the screen (appendix: silent; [code] ends, too).
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
-        # A.3 "no moving objects": planks count, a see-saw's weight does not; a lost ball that falls
-        # for ever below the screen counts as moving [code]. A ball in a bucket is at rest, though
+        # A.3 "no moving objects". Planks are in the list, but their centres rest on the pivot, so a
+        # turning plank counts as still. A see-saw's weight is not in it. A lost ball that falls for
+        # ever below the screen counts as moving [code]. A ball in a bucket is at rest, though
         # gravity has just added 0.07 to its speed.
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
@@ -1247,60 +1173,46 @@ class CreateEnv(gym.Env):
         # appendix: 30 actions; [code] one more than its limit; [here] the exact limit.
         return terminated, not terminated and self._actions >= self.task.max_actions
 
-    def _paint_backgrounds(self) -> None:
-        """Pictures of all that stands still; what moves is drawn on copies of them."""
-        # [code] draws the target first; [here] what stands still, which is kept from step to step.
-        self._backgrounds = [Canvas(84, in_colour=False)]
-        if self.render_mode:
-            self._backgrounds.append(Canvas(PICTURE_SIZE, in_colour=True))
-        for canvas in self._backgrounds:
-            self._draw_objects(canvas, moving=False)
-
-    def _draw_objects(self, canvas: Canvas, moving: bool) -> None:
+    def _draw_objects(self, canvas: Canvas, moving: bool) -> Canvas:
         for one in self._objects:
-            if (one.body is not None) == moving:
-                draw(canvas, one.tool, *one.pose())
+            if moving and one.body:
+                draw(canvas, one.tool, one.body.position, one.body.angle)
+            elif not moving and not one.body:
+                draw(canvas, one.tool, one.place)
+        return canvas
 
     def _observe(self) -> dict[str, np.ndarray]:
-        # A.3 State: the newest grey picture and the two before it, in a fresh array every time, so
-        # that earlier observations keep theirs.
-        canvas = self._backgrounds[0].copy()
-        self._draw_objects(canvas, moving=True)
-        self._frames = np.concatenate([self._frames[1:], canvas.picture()[None]])  # (3, 84, 84)
-        return {"state": self._frames, "available": self.available.copy()}
+        # A.3 State: the newest grey picture and the two before it. Copies go out, so that nothing
+        # done to an observation comes back into the next.
+        canvas = Canvas(84, in_colour=False)
+        canvas.image.paste(self._background.image)
+        newest = self._draw_objects(canvas, moving=True).picture()
+        self._frames = np.concatenate([self._frames[1:], newest[None]])  # (3, 84, 84)
+        return {"state": self._frames.copy(), "available": self.available.copy()}
 
     def _take_picture(self) -> None:
         """This moment for people: the scene, a caption, and beside it the policy's last state."""
         if not self.render_mode:
             return
-        # Small dots show where the balls have been.
+        # The scene: what stands still, small dots where the balls have been, what moves.
         for one in self._objects:
-            if one.kind.contact == MOVING:
-                self._trail.append((one.body.position, 0.4, one.kind.paint))
-        canvas = self._backgrounds[1].copy()
-        for dot in self._trail:
-            canvas.disc(*dot, edge=0)
-
-        reached = ""
-        if self._goal_hit:
-            reached = "goal!"
-        elif self._marker and self._target_hit:
-            reached = "target hit"
+            if one.kind.contact == MOVING and one.kind.shape == "disc":
+                self._trail.append((one.body.position, one.kind.colour))
+        canvas = self._draw_objects(Canvas(PICTURE_SIZE, in_colour=True), moving=False)
+        for place, colour in self._trail:
+            canvas.stroke([place], 0.8, colour)
         self._draw_objects(canvas, moving=True)
 
         # One page: the scene, the caption under it, the three grey pictures beside it.
         size = PICTURE_SIZE
-        page = Image.new("RGB", (size + 6 + size // 3, size + size // 14), PAPER)
+        page = Image.new("RGB", (size + 6 + size // 3, size + 30), "lightgrey")
         page.paste(Image.fromarray(canvas.picture()))
         state = Image.fromarray(np.vstack(self._frames)).resize((size // 3, size))
         page.paste(state, (size + 6, 0))
-        pen = ImageDraw.Draw(page)
-        font = ImageFont.load_default(size / 27)
-        y = 1.035 * size
-        words = f"{self._actions}/{self.task.max_actions}  {self._tool.kind} {self.placement}"
-        ink = RED.colour if self.placement in REFUSED else INK
-        pen.text((0.02 * size, y), words, ink, font, "lm")
-        pen.text((0.98 * size, y), reached, "#2a7f3f", font, "rm")
+        caption = f"{self._actions}/{self.task.max_actions}  {self._tool.kind} {self.placement}"
+        if self._goal_hit:
+            caption += ", goal!"
+        ImageDraw.Draw(page).text((8, size + 15), caption, INK, ImageFont.load_default(16), "lm")
         self._pictures.append(np.array(page))
 
     def render(self) -> np.ndarray | None:
@@ -1309,19 +1221,14 @@ class CreateEnv(gym.Env):
 
     def render_frames(self) -> list[np.ndarray]:
         """Pictures of the last step: 5, or 1 right after a reset, or none without render_mode."""
-        if self.render_mode and not self._pictures:
-            raise gym.error.ResetNeeded("call reset() before the first picture")
-        return self._pictures
+        return list(self._pictures)
 
 
 gym.register("ActionGen/Create-v0", entry_point=f"{__name__}:CreateEnv")
 
 
 def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **options):
-    """SyncVectorEnv of `num_envs` independent streams; `options`, ValueErrors as `CreateEnv`.
-
-    It is already seeded: `reset()` without a seed goes on with these streams.
-    """
+    """SyncVectorEnv of `num_envs` independent streams, already seeded; `options` as `CreateEnv`."""
     one = partial(CreateEnv, action_pool, num_available, **options)
     envs = gym.vector.SyncVectorEnv([one] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
     # seed + i would let neighbouring seeds share environments; these seeds are unrelated.
@@ -1364,19 +1271,13 @@ def action_observations(action_ids, num_observations, modality="xy", seed=0, wor
     shape = (len(action_ids), num_observations, PROBE_LENGTH, *shapes[modality])
     result = np.empty(shape, np.uint8 if modality == "video" else np.float32)
 
-    def fill(recordings) -> None:
-        # disable=None: no bar where nobody watches (a log file, a test)
-        bar = tqdm(recordings, "probe ball", len(result), leave=False, disable=None)
-        for row, recording in enumerate(bar):
-            result[row] = recording
-
     record = partial(_record, num_observations, modality, seed)
     ids = np.asarray(action_ids).tolist()
-    if workers == 1:
-        fill(map(record, ids))
-    else:
-        with multiprocessing.Pool(workers) as pool:
-            fill(pool.imap(record, ids, chunksize=4))
+    # In several processes or in this one. disable=None: no bar where nobody watches (a log file).
+    with multiprocessing.Pool(workers) if workers > 1 else nullcontext() as pool:
+        recordings = pool.imap(record, ids, chunksize=4) if pool else map(record, ids)
+        for row, recording in enumerate(tqdm(recordings, "probe ball", len(ids), disable=None)):
+            result[row] = recording
     return result
 
 
@@ -1399,19 +1300,17 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
         velocity = speed * gap / np.maximum(distance, 1e-9)
         states, contact = _launch(tool, places[missing], start, velocity)
 
-        # `contact` is the physics step of the first touch, 1..90. It is 91 after a miss: launch
-        # again, but keep the miss of the last attempt. It is 0 if the ball was put into the tool:
-        # launch again in any case.
+        # `contact`: 0 = started inside the tool, always launch again; 1..90 = step of the first
+        # touch, keep; 91 = a miss, launch again, but from the 8th launch on keep it.
         hit = contact <= PROBE_STEPS
         done = (contact > 0) & (hit | (attempt >= PROBE_ATTEMPTS - 1))
 
-        # Keep 7 of the 9 states, from the third one before the touch on, so that the touch is near
-        # the middle, or from the first or last that leaves 7. After a miss keep the middle ones.
-        touch = (contact[done] - 1) // PROBE_EVERY
+        # Keep 7 of 9 states, starting 3 before the touch, clipped to a start of 0..2; after a miss
+        # start at 1. So the touch is near the middle.
+        touch = (contact[done] - 1) // PROBE_EVERY  # the first state recorded at the touch or later
         first = np.where(hit[done], np.clip(touch - 3, 0, 2), 1)
         columns = first[:, None] + np.arange(PROBE_LENGTH)  # (done, 7)
-        rows = np.arange(len(columns))[:, None]  # (done, 1)
-        trajectories[missing[done]] = states[done][rows, columns]
+        trajectories[missing[done]] = np.take_along_axis(states[done], columns[..., None], axis=1)
         missing = missing[~done]
         attempt += 1
     if modality == "video":
@@ -1422,8 +1321,8 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
 def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray]:
     """Launch m balls at m copies of a tool, each pair in its own cell of one big space.
 
-    places, start (m, 2) norm; velocity (m, 2) units/s. Returns states (m, 9, 7) float32, the last
-    number a plank's angle, and the step of the first contact (m,): 0 overlap at launch, 91 never.
+    places, start (m, 2) norm; velocity (m, 2) units/s -> states (m, 9, 7) float32, the last number
+    a plank's angle; the step of the first contact (m,), 0 if they overlap at launch, 91 for none.
     """
     m = len(places)
     offsets = CELL * np.stack(np.divmod(np.arange(m), ceil(sqrt(m))), axis=1)  # (m, 2) units
@@ -1457,35 +1356,31 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
             now[:, 2:4] = ([probe.body.position for probe in probes] - offsets) * 2 / WORLD - 1
             # [code] maps velocities like positions (v/42 - 1, a slip); [here] v/42
             now[:, 4:6] = np.array([probe.body.velocity for probe in probes]) * 2 / WORLD
-            now[:, 6] = [one.pose()[1] for one in tools]
+            now[:, 6] = [one.body.angle if one.body else 0.0 for one in tools]
     contact[overlap] = 0
     return states, contact
 
 
 def _film(tool: Tool, trajectories: np.ndarray) -> np.ndarray:
-    """One tool's trajectories (n, 7, 7) as pictures, uint8 (n, 7, 48, 48).
-
-    B: "collected identically as the state case, only the modality changes": the whole scene.
-    """
-    blank = Canvas(PROBE_VIDEO, in_colour=False)
+    """The scenes of one tool's trajectories (n, 7, 7) as pictures, uint8 (n, 7, 48, 48)."""
     video = np.empty((*trajectories.shape[:2], PROBE_VIDEO, PROBE_VIDEO), np.uint8)
     for index in np.ndindex(video.shape[:2]):
         *places, _, _, angle = trajectories[index].tolist()
         tool_x, tool_y, ball_x, ball_y = map(to_units, places)
-        canvas = blank.copy()
+        canvas = Canvas(PROBE_VIDEO, in_colour=False)
         draw(canvas, tool, Vec2d(tool_x, tool_y), angle)
         draw(canvas, PROBE_BALL, Vec2d(ball_x, ball_y))
         video[index] = canvas.picture()
     return video
 
 
-# ---- pictures for people (Figures 3 and 7), and a window to play in ----
+# ---- pictures for people (Figures 3 and 7), a window to play in, and the command ----
 
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
     """Write pictures (h, w, 3) uint8 as a GIF that rests on its last picture.
 
-    The file appears whole or not at all.
+    The GIF is made in memory first. If writing it fails, no half file stays, nor an older one.
     """
     data = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
@@ -1503,47 +1398,18 @@ def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None
 
 
 def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, bool]:
-    """A random episode: (frames, return, goal reached).
-
-    Half of the steps choose at random among all that is available, the others choose the no-op.
-    """
-    rng = np.random.default_rng(seed)
+    """A random episode: (frames, return, goal reached)."""
     env.reset(seed=seed)
-    frames = list(env.render_frames())
+    env.action_space.seed(seed)
+    frames = env.render_frames()
     total = 0.0
     over = False
     while not over:
-        choice = int(rng.integers(env.num_available)) if rng.random() < 0.5 else NO_OP
-        action = {"choice": choice, "position": rng.uniform(-0.9, 0.9, 2)}
-        _, reward, terminated, truncated, info = env.step(action)
+        _, reward, terminated, truncated, info = env.step(env.action_space.sample())
         total += reward
         over = terminated or truncated
         frames += env.render_frames()
     return frames, total, bool(info[METRIC])
-
-
-def new_sheet(pictures: dict[str, np.ndarray], columns: int):
-    """Square pictures of the world, each under its title, as a matplotlib figure."""
-    from matplotlib.figure import Figure  # here, so that training does not need it
-
-    rows = ceil(len(pictures) / columns)
-    sheet = Figure(figsize=(3 * columns, 3.3 * rows), layout="constrained")
-    for number, (title, picture) in enumerate(pictures.items()):
-        axes = sheet.add_subplot(rows, columns, number + 1)
-        axes.imshow(picture, extent=(0, WORLD, 0, WORLD))
-        axes.set(title=title, xticks=[], yticks=[])
-    return sheet
-
-
-def tasks_sheet():
-    """Figure 7: every task as it starts."""
-    pictures = {}
-    for number, task in enumerate(TASKS):
-        env = CreateEnv(task=task, render_mode="rgb_array")
-        env.reset(seed=0)
-        title = f"({chr(ord('a') + number)}) {task}"
-        pictures[title] = env.render()[:PICTURE_SIZE, :PICTURE_SIZE]  # the scene
-    return new_sheet(pictures, columns=4)
 
 
 def portraits(tools: Sequence[Tool], columns: int, units: float = 36.0) -> np.ndarray:
@@ -1555,46 +1421,51 @@ def portraits(tools: Sequence[Tool], columns: int, units: float = 36.0) -> np.nd
     return canvas.picture()
 
 
-def tools_sheet():
-    """Four tools of each class that are 15 degrees apart."""
-    pictures = {}
-    for label in TOOL_CLASSES:
-        ids = np.flatnonzero((action_labels() == label) & IS_COARSE)
-        four = [TOOLS[ids[int(share * len(ids))]] for share in (0.98, 0.12, 0.45, 0.7)]
-        pictures[label] = portraits(four, columns=2)
-    return new_sheet(pictures, columns=5)
+def draw_sheet(name: str, pool: np.ndarray):
+    """A matplotlib figure: "tasks", "tools", or "probe" with three tools of `pool`."""
+    from matplotlib.figure import Figure  # here, so that training does not need it
 
+    pictures = {}  # title: square picture
+    if name == "tasks":  # Figure 7: every task as it starts
+        for task in TASKS:
+            env = CreateEnv(task=task, render_mode="rgb_array")
+            env.reset(seed=0)
+            pictures[task] = env.render()[:PICTURE_SIZE, :PICTURE_SIZE]  # the scene
+    elif name == "tools":  # four tools of each class
+        for label in TOOL_CLASSES:
+            ids = np.flatnonzero((action_labels() == label) & IS_COARSE)
+            four = ids[len(ids) // 10 :: ceil(len(ids) / 4)]
+            pictures[label] = portraits([TOOLS[action] for action in four], columns=2)
+    else:  # three tools, each alone in the world
+        ids = np.unique(pool[[len(pool) // 8, len(pool) // 2, -1]])
+        for action in ids:
+            title = f"{TOOLS[action].kind}, id {action}"
+            pictures[title] = portraits([TOOLS[action]], columns=1, units=WORLD)
 
-def probe_sheet(pool: np.ndarray):
-    """Probe-ball trajectories over three tools, moved so that the tool stands in the middle."""
-    ids = np.unique(pool[[len(pool) // 8, len(pool) // 2, -1]])
-    pictures = {}
-    for action in ids:
-        tool = TOOLS[action]
-        pictures[f"{tool.kind}, id {action}"] = portraits([tool], 1, WORLD)
-    sheet = new_sheet(pictures, columns=len(ids))
-    recordings = action_observations(ids, 40, "state")  # (tools, 40, 7, 6)
-    for axes, states in zip(sheet.axes, recordings, strict=True):
-        x, y = to_units(states[..., 2:4] - states[..., :2]).T  # (7, 40) each
-        axes.plot(x, y, ".-", linewidth=0.6, markersize=3)
-        axes.plot(x[-1], y[-1], "k.")  # where the ball is last
-        axes.set(xlim=(0, WORLD), ylim=(0, WORLD))
+    columns = min(len(pictures), 4)
+    rows = ceil(len(pictures) / columns)
+    sheet = Figure(figsize=(3 * columns, 3.3 * rows), layout="constrained")
+    for number, (title, picture) in enumerate(pictures.items()):
+        axes = sheet.add_subplot(rows, columns, number + 1)
+        axes.imshow(picture, extent=(0, WORLD, 0, WORLD))
+        axes.set(title=title, xticks=[], yticks=[])
+    if name == "probe":  # trajectories, moved so that the tool stands in the middle
+        recordings = action_observations(ids, 40, "state")  # (tools, 40, 7, 6)
+        for axes, states in zip(sheet.axes, recordings, strict=True):
+            x, y = to_units(states[..., 2:4] - states[..., :2]).T  # (7, 40) each
+            axes.plot(x, y, ".-", linewidth=0.6, markersize=3)
+            axes.set(xlim=(0, WORLD), ylim=(0, WORLD))
     return sheet
 
 
 def play(env: CreateEnv, seed: int = 0) -> None:
-    """Place tools by mouse: click on a tool, then on the scene; space waits.
-
-    Beside the scene is what the policy sees, the newest picture at the bottom.
-    """
+    """Place tools by mouse: click on a tool, then on the scene; space waits."""
     import matplotlib.pyplot as plt  # here, so that no other command needs a display
 
-    figure, (menu, scene) = plt.subplots(1, 2, width_ratios=(2, 3), layout="constrained")
-    figure.set_size_inches(13, 6.5)
+    figure, (menu, scene) = plt.subplots(1, 2, figsize=(13, 6.5), layout="constrained")
     columns = ceil(sqrt(env.num_available))  # of the menu
-    chosen = NO_OP  # place in `available`
+    chosen = 0  # place in `available`; that of the no-op
     total = 0.0
-    over = False
     env.reset(seed=seed)
 
     def show() -> None:
@@ -1610,41 +1481,34 @@ def play(env: CreateEnv, seed: int = 0) -> None:
 
     def act(choice, position) -> None:
         # One step. The end of an episode stays in view; the act after it begins the next one.
-        nonlocal total, over
-        if over:
-            total = 0.0
-            over = False
+        nonlocal chosen, total
+        if env._over:
             env.reset()
-            return
-        action = {"choice": choice, "position": position}
-        _, reward, terminated, truncated, info = env.step(action)
-        total += reward
-        over = terminated or truncated
-        if over:
-            print(f"return {total:.2f}, {METRIC} {info[METRIC]:.0f}")
+            chosen = 0
+            total = 0.0
+        else:
+            total += env.step({"choice": choice, "position": position})[1]
+        show()
 
     def on_click(event) -> None:
         nonlocal chosen
         if event.inaxes is menu:
             number = int(event.ydata) * columns + int(event.xdata)
             chosen = min(number, env.num_available - 1)
-        elif event.inaxes is scene:
-            unit = PICTURE_SIZE / 2  # from pixels to norm
-            act(chosen, (event.xdata / unit - 1, 1 - event.ydata / unit))
-        show()
+            show()
+        elif event.inaxes is scene and max(event.xdata, event.ydata) <= PICTURE_SIZE:
+            # From pixels to norm. The caption and the policy's pictures are no place for a tool.
+            half = PICTURE_SIZE / 2
+            act(chosen, (event.xdata / half - 1, 1 - event.ydata / half))
 
     def on_key(event) -> None:
         if event.key == " ":
-            act(NO_OP, (0.0, 0.0))
-            show()
+            act(0, (0.0, 0.0))
 
     figure.canvas.mpl_connect("button_press_event", on_click)
     figure.canvas.mpl_connect("key_press_event", on_key)
     show()
     plt.show()
-
-
-# ---- the command ----
 
 
 @dataclass
@@ -1655,10 +1519,9 @@ class Args:
     tools: tuple[Literal[TOOL_CLASSES], ...] = ()  # available are only tools of these classes
     seed: int = 0  # of the first episode: level, available tools, random actions
     tries: int = 400  # random episodes played; the one with the best return is drawn
-    play: bool = False  # open a window and place the tools yourself; ignored beside a sheet
-    all_tasks: bool = False  # sheet of all tasks (Figure 7)
-    show_tools: bool = False  # sheet of tools of every class
-    show_probe: bool = False  # sheet of probe-ball trajectories over three of the tools
+    play: bool = False  # open a window and place the tools yourself
+    # draw the tasks (Figure 7), tools of every class, or probe-ball trajectories over three tools
+    sheet: Literal["tasks", "tools", "probe"] | None = None
     out: Path = Path("runs/demo")  # folder for the pictures
 
 
@@ -1669,24 +1532,16 @@ def main(args: Args) -> None:
     pool = split_actions()["train"]
     if args.tools:
         pool = np.flatnonzero(np.isin(action_labels(), args.tools) & IS_COARSE)
-    sheets = {}
-    if args.all_tasks:
-        sheets["create_tasks.png"] = tasks_sheet()
-    if args.show_tools:
-        sheets["create_tools.png"] = tools_sheet()
-    if args.show_probe:
-        sheets["create_probe.png"] = probe_sheet(pool)
-    args.out.mkdir(parents=True, exist_ok=True)
-    for name, sheet in sheets.items():
-        sheet.savefig(args.out / name)
-        print(f"wrote {args.out / name}")
-    if sheets:
-        return
-
     num_available = min(NUM_AVAILABLE, len(pool) + 1)
     env = CreateEnv(pool, num_available, "rgb_array", args.task)
     if args.play:
         play(env, args.seed)
+        return
+    if args.sheet:
+        args.out.mkdir(parents=True, exist_ok=True)
+        path = args.out / f"create_{args.sheet}.png"
+        draw_sheet(args.sheet, pool).savefig(path)
+        print(f"wrote {path}")
         return
 
     # Find the best episode without pictures, then play it again with pictures.

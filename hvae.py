@@ -9,20 +9,26 @@ observations share (the action) lands in c; what differs (start cell, camera ang
     ELBO per observation = mean_j [ log p(x_j | z_j, c) - KL( q(z_j | x_j, c) || p(z_j | c) ) ]
                            - KL( q(c | X) || N(0, I) ) / |X|
 
-The representation of an action is the mean of q(c | X). It is computed for every action of the
-split and for CREATE's no-op; other rows stay zero. The networks are trained on training actions
-only: unseen actions are encoded without re-training.
+The representation of an action is the mean of q(c | X). The networks learn from training actions
+and CREATE's no-op only (those of the oracle encoder from all actions). Then every action of the
+split and the no-op are encoded, without re-training; other rows of the table stay zero.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
     python hvae.py gridworld --train-on all      # the oracle encoder: trained on all actions
-    python hvae.py create --split full           # B; also --modality video; or: stacking
+    python hvae.py create --modality video       # B: videos; B's Full Split: --split full
     python hvae.py gridworld --recipe paper      # the numbers of Tables 3-4: days on a CPU
     python hvae.py create --recipe quick --help  # the numbers of this recipe
     python hvae.py my_env.py                     # an environment of your own, in a file
 
-Your file defines NUM_ACTIONS, MODALITIES, split_actions (parts train, valid, test), action_labels,
-action_observations and engineered_representations; SPLITS, NO_OP and UNITS only if needed.
+Your file defines NUM_ACTIONS, MODALITIES; if needed SPLITS (names), NO_OP (an id), UNITS; and
+
+    split_actions(split, seed) -> {"train": ids, "valid": ids, "test": ids}
+    action_labels() -> (NUM_ACTIONS,); engineered_representations() -> (NUM_ACTIONS, D)
+    action_observations(ids, count, modality, seed, workers) -> (len(ids), count, L, F) numbers
+
+A modality "image" gives (..., S, S), "video" (..., L, S, S), greys 0-255, S 48 or 84; "onehot" two
+cells 0-79. Random numbers must depend on seed *and* id, for actions are recorded in several calls.
 Marks in the comments: "appendix:" quotes the paper where sources differ; [code] is the authors'
 released implementation; [here] is this repository's choice, with its reason.
 """
@@ -39,28 +45,25 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
 import tyro
 from torch.distributions import Categorical, Normal, kl_divergence
 from tqdm import tqdm
 
-# Paper map: Tables 3-4 -> Args, HYPERPARAMETERS (but "MLP hidden layers": D.3.1 has each depth);
-# D.3.1 -> the networks, in its order, from conv_encoder to conv_decoder; B -> prepare, HVAE, VAE;
-# D.1 -> fit; Figures 4-6 -> plot_tsne.
+# Paper map: D.2 (Tables 3-4) -> Args, HYPERPARAMETERS, but for "MLP hidden layers": D.3.1 has each
+# depth. D.3.1 -> the networks, in its order; its loss -> ObservationModel.forward. B -> prepare,
+# HVAE, VAE; D.1 -> fit; Figures 4-6 -> plot_tsne.
 # Shapes: A actions in a batch, N recorded observations of each, n of them in an update, B = A * n;
 # L states per trajectory (the first is given, T = L - 1 are predicted), F numbers per state; C = Z
 # sizes of c and z; H hidden width; S side of a picture.
 
-# Name on the command line -> module; one of your own needs no line here. The Recommender has only
-# engineered representations: there is nothing to train an encoder on.
+# Name on the command line -> module. (The Recommender has nothing to record, so no encoder.)
 ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
-# How relative trajectories are scaled; an environment whose numbers are not of the order of 1 has
-# UNITS of its own. First states lie within centre +- half_width; differences are counted in steps,
-# so small that the decoder's smallest sigma, exp(-4 / 2) = 0.135 steps, tells two actions apart.
+# Scale of relative trajectories, if an environment has no UNITS of its own. First states lie within
+# centre +- half_width; `step` is the unit of moves. What two actions do should differ by more than
+# 0.135 of it, for the decoder's sigma is never below exp(-4 / 2) = 0.135.
 UNITS = dict(centre=0.0, half_width=1.0, step=1.0)
-
 VISUAL = ("image", "video")  # modalities that pass the convolutions; all others are trajectories
 CLASSES = 80  # B: "two 80-dimensional one-hot vectors"
 RECIPES = ("quick", "fast", "paper")
@@ -83,8 +86,8 @@ class Args:
     runs_dir: str = "runs"  # tables go to <runs_dir>/hvae, recordings to <runs_dir>/observations
     representation_size: int  # size of c and of z
     batch_size: int  # actions in an update
-    epochs: int  # passes over the training actions, if updates is 0
-    updates: int  # number of updates, in place of epochs
+    epochs: int  # passes over the training actions, or 0: updates says how long
+    updates: int  # number of updates, or 0: epochs says how long
     learning_rate: float  # of RAdam (D.1)
     hidden: int  # default width of the networks
     q_hidden: int  # width of q(c|X)
@@ -95,7 +98,7 @@ class Args:
     kl_warmup: float  # share of the updates in which the weight of the KLs climbs to 1
     compact_lstm: bool  # a Bi-LSTM of half the width, its directions concatenated
     log_var_start: float | None  # first log-variance of the decoder (None: drawn from N(0, 1))
-    log_var_rate: float  # factor on the learning rate of free log-variances
+    log_var_rate: float  # factor on the learning rate of log-variances that are parameters
 
 
 # ---- Tables 3 and 4 ----
@@ -136,7 +139,7 @@ EXCEPTIONS = {
     # 160 zeros and ones say the same as 2 numbers, but it takes longer to learn what they mean.
     "onehot": {"updates": (2_000, 4_000, 0)},
     # Without these changes the model ignored z (how the ball was launched): the squared error, in
-    # UNITS' steps, stayed near 6.5; with all of them it is below 1. Not tested one by one.
+    # steps of UNITS, stayed near 6.5; with all of them it is below 1. Not tested one by one.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
@@ -178,7 +181,7 @@ class UserError(Exception):
 def choose(what: str, value: str, allowed) -> None:
     """UserError unless `value` is one of the allowed names."""
     if value not in allowed:
-        raise UserError(f"unknown {what} {value!r}; allowed: {', '.join(allowed)}")
+        raise UserError(f"unknown {what} {value!r}; allowed: {', '.join(map(str, allowed))}")
 
 
 def load_environment(name: str):
@@ -191,7 +194,7 @@ def load_environment(name: str):
     path = Path(name).resolve()
     if path.suffix != ".py" or not path.is_file():
         raise UserError(f"unknown environment {name!r}; allowed: {', '.join(ENVIRONMENTS)}, *.py")
-    # Python looks for modules in the folders of sys.path; processes that it starts do so, too.
+    # In the folders of sys.path Python, and the processes that it starts, look for modules.
     if path.stem not in sys.modules:
         sys.path.insert(0, str(path.parent))
     module = importlib.import_module(path.stem)
@@ -212,9 +215,7 @@ def default_args(env: str, recipe: str = "fast", modality: str | None = None) ->
         raise UserError(f"{env} has no action observations, only engineered representations")
     modality = modality or module.MODALITIES[0]
     choose("modality", modality, module.MODALITIES)
-    choose("recipe", recipe, RECIPES)
-    exceptions = EXCEPTIONS.get(modality, EXCEPTIONS.get(environment_name(env), {}))
-    table = HYPERPARAMETERS | exceptions
+    table = HYPERPARAMETERS | EXCEPTIONS.get(modality, EXCEPTIONS.get(environment_name(env), {}))
     numbers = {name: row[RECIPES.index(recipe)] for name, row in table.items()}
     return Args(env=env, modality=modality, recipe=recipe, **numbers)
 
@@ -244,7 +245,7 @@ def prepare(raw, args):
         if args.relative:
             raw = torch.cat([first, moves + CLASSES // 2], 1)
             later = later - first + CLASSES // 2
-        one_hot = F.one_hot(raw.long(), CLASSES)  # (B, L, 2, 80)
+        one_hot = nn.functional.one_hot(raw.long(), CLASSES)  # (B, L, 2, 80)
         return one_hot.flatten(2).float(), later.long()
     if not args.relative:
         return raw, later
@@ -268,7 +269,7 @@ class Residual(nn.Module):
         self.layers = nn.Sequential(*stack)
 
     def forward(self, x):
-        return F.relu(self.layers(x) + x)
+        return torch.relu(self.layers(x) + x)
 
 
 class SumReLU(nn.Module):
@@ -279,14 +280,14 @@ class SumReLU(nn.Module):
         self.linears = nn.ModuleList(nn.Linear(size, width) for size in inputs)
 
     def forward(self, *inputs):
-        return F.relu(sum(linear(x) for linear, x in zip(self.linears, inputs, strict=True)))
+        return torch.relu(sum(linear(x) for linear, x in zip(self.linears, inputs, strict=True)))
 
 
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
     # D.3.1 says only "1D batch-norm"; [code] this, also epsilon and momentum. A norm per dimension
-    # would blow up those dimensions of a latent that carry nothing: none could fall silent.
+    # would scale a dimension of c or z that is not used up to variance 1: none could fall silent.
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
@@ -306,23 +307,20 @@ def initialise(module):
         nn.init.zeros_(module.bias)
 
 
-# [code] Channels after each layer of the convolutional encoder, by the side of its pictures.
-# Videos: B says 84 x 84, A.3 and D.3.1 say 48 x 48; [code] has 48, too.
-ENCODER_CHANNELS = {48: (8, 8, 16, 16, 16, 16, 32), 84: (8, 8, 16, 16, 16, 16, 32, 32, 32)}
-# [code] Side and channels after each stage of the convolutional decoder.
-DECODER_STAGES = {
-    48: ((6, 32), (12, 32), (24, 16), (48, 16)),
-    84: ((6, 32), (11, 32), (21, 16), (42, 16), (84, 16)),
-}
+# By the side of a picture. Of videos it is 84 in B, 48 in A.3, D.3.1 and [code].
+ENCODER_LAYERS = {48: 7, 84: 9}
+ENCODER_CHANNELS = (8, 8, 16, 16, 16, 16, 32, 32, 32)  # [code] after each layer
+DECODER_SIDES = {48: (6, 12, 24, 48), 84: (6, 11, 21, 42, 84)}  # [code] after each stage
 
 
 def conv_encoder(side):
-    """Convolutional Encoder: pictures (B, 1, S, S) -> (B, 288); 7 layers for S = 48, 9 for 84."""
+    """Convolutional Encoder: pictures (B, 1, S, S) -> (B, 288)."""
+    choose("side of a picture", side, ENCODER_LAYERS)
     # A layer is a 3x3 convolution, batch norm and ReLU. Every other one halves the picture:
     # 48 -> 24 -> 12 -> 6 -> 3, or 84 -> 42 -> 21 -> 11 -> 6 -> 3.
     layers = []
     before = 1
-    for i, after in enumerate(ENCODER_CHANNELS[side]):
+    for i, after in enumerate(ENCODER_CHANNELS[: ENCODER_LAYERS[side]]):
         stride = 2 - i % 2  # 2, 1, 2, 1, ...
         layers += [nn.Conv2d(before, after, 3, stride, 1), nn.BatchNorm2d(after), nn.ReLU()]
         before = after
@@ -413,16 +411,18 @@ def conv_decoder(side, mask):
     # and ReLU. The last layer is a 1x1 convolution; all comes out in [0, 1].
     layers = [nn.Unflatten(1, (32, 3, 3))]
     before = 32
-    for size, after in DECODER_STAGES[side]:
-        odd = size % 2  # a kernel of 2 makes 2n of n, a kernel of 3 with padding 2n - 1
+    for size in DECODER_SIDES[side]:
+        after = 32 if size <= 12 else 16  # [code]
+        # With stride 2, kernel 2 and padding 0 make 2n of n; kernel 3 and padding 1 make 2n - 1.
+        odd = size % 2
         layers += [nn.Conv2d(before, before, 3, 1, 1), nn.BatchNorm2d(before), nn.ReLU()]
-        double = nn.ConvTranspose2d(before, after, kernel_size=2 + odd, stride=2, padding=odd)
+        double = nn.ConvTranspose2d(before, after, 2 + odd, 2, odd)  # kernel, stride, padding
         layers += [double, nn.BatchNorm2d(after), nn.ReLU()]
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # [here] The picture starts white, as most of a video is. A grey one is worse than the first
-        # frame everywhere: the mask would go to 0 (see decode) before the picture has learned.
+        # [here] The picture starts white, as most of a video is. A grey one would be worse than the
+        # first frame everywhere, so the mask would fall to 0, where no picture learns (see decode).
         nn.init.constant_(last.bias[:1], 3.0)
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -480,11 +480,12 @@ class ObservationModel(nn.Module):
     def add_linear_path(self, q, h):
         # [here] mean = linear map + 0.1 * network. A network can memorise where each training
         # action goes; a linear map cannot, so it carries over to unseen actions.
-        return Normal(self.path(h) + 0.1 * q.mean, q.stddev) if self.path else q
+        if self.path:
+            q = Normal(self.path(h) + 0.1 * q.mean, q.stddev, validate_args=False)
+        return q
 
     def represent(self, h):
-        # Encoded observations (A, N, H) -> representations (A, C): the mean of q(c | X), or the
-        # average of the VAE's means of q(z | x).
+        # Encoded observations (A, N, H) -> representations (A, C): means of c, or of z, averaged.
         mean = self.q(h).mean  # HVAE: (A, C); VAE: (A, N, C)
         return mean.view(len(h), -1, mean.shape[-1]).mean(1)  # (A, 1 or N, C) -> (A, C)
 
@@ -500,9 +501,8 @@ class ObservationModel(nn.Module):
         picture = pixels[:, :, :1] - 0.5
         if self.args.modality == "image":
             return picture
-        # Temporal skip connection: where the mask is 0, the first frame shows through.
-        # appendix: mask * picture + frame; [code] mask * picture + (1 - mask) * frame; [here] as
-        # the code, since the plain sum leaves the range of a pixel.
+        # Temporal skip connection: where the mask is 0, the first frame shows through. appendix:
+        # mask * picture + frame; [code] as below; [here] as the code: a sum can exceed a pixel.
         mask = pixels[:, :, 1:]
         return mask * picture + (1 - mask) * frame
 
@@ -568,7 +568,7 @@ class VAE(ObservationModel):
         # Encoded observations (A, n, H) -> latents (z,), KL of z (A, n, Z), and no KL of c.
         q_z = self.q(h)
         kl_z = kl_divergence(q_z, Normal(0.0, 1.0))
-        return (q_z.rsample().flatten(0, 1),), kl_z, torch.zeros(1, 1)
+        return (q_z.rsample().flatten(0, 1),), kl_z, torch.zeros(1)
 
 
 # ---- training ----
@@ -602,31 +602,33 @@ def source_hash(module):
 
 
 def observe(module, ids, args):
-    # Raw observations (len(ids), N, ...), recorded once for all encoders; old ones are deleted.
-    kind = f"{environment_name(args.env)}-{args.modality}-{args.observations}"
-    name = f"{kind}-{source_hash(module)}-{short_hash(ids.tolist())}.npy"
-    path = Path(args.runs_dir) / "observations" / name
+    # Raw observations (len(ids), N, ...), recorded once for all encoders.
+    N = args.observations
+    kind = f"{environment_name(args.env)}-{args.modality}-{N}"
+    source = source_hash(module)
+    path = Path(args.runs_dir) / "observations" / f"{kind}-{source}-{short_hash(ids.tolist())}.npy"
+    workers = os.cpu_count() or 1
 
     def record(file):
-        # Pictures of all actions do not fit in memory: first the header of a .npy file, with the
-        # shape of all, then the data in pieces of 128 actions.
-        for i in range(0, len(ids), 128):
-            # Always seed 0: encoders differ by their seed, not by their data.
-            some = ids[i : i + 128]
-            workers = os.cpu_count() or 1
-            data = module.action_observations(some, args.observations, args.modality, 0, workers)
+        # All pictures do not fit in memory: first the header of a .npy file, then 128 actions at a
+        # time. Always seed 0: encoders differ by their seed, not by their data.
+        for i in tqdm(range(0, len(ids), 128), "recording", disable=None):
+            try:
+                data = module.action_observations(ids[i : i + 128], N, args.modality, 0, workers)
+            except OSError as error:  # `write` would take it for a full disk
+                raise ValueError("action_observations failed") from error
             if i == 0:
                 shape = (len(ids), *data.shape[1:])
                 header = dict(descr=data.dtype.str, fortran_order=False, shape=shape)
                 np.lib.format.write_array_header_1_0(file, header)
             file.write(data.tobytes())
 
-    if not path.exists():
-        print(f"recording {args.observations} observations of {len(ids)} actions", flush=True)
-        for old in path.parent.glob(f"{kind}-*.npy"):
-            old.unlink(missing_ok=True)  # another process may have deleted it just now
-        write(path, record)
     print(f"recordings: {path} (delete it to record anew)", flush=True)
+    if not path.exists():
+        for old in path.parent.glob(f"{kind}-*.npy"):
+            if source not in old.name:  # by another version of the environment's file
+                old.unlink(missing_ok=True)  # another process may have deleted it just now
+        write(path, record)
     return np.load(path, mmap_mode="r")  # only what is used is in memory (810 shapes: 5.9 GB)
 
 
@@ -650,19 +652,18 @@ def fit(model, data, rows, args):
             queue = rng.permutation(rows)
         actions = queue[:batch, None]  # (A, 1)
         queue = queue[batch:]
-        # Of each action n different observations: where the n smallest of random numbers are.
+        # Of each action n different observations: the positions of the n smallest random numbers.
         picks = rng.random((batch, data.shape[1])).argpartition(n - 1)[:, :n]  # (A, n)
         parts = model(torch.from_numpy(data[actions, picks]).to(args.device))  # (A, n, ...)
-
         # Minus the ELBO. In a warm-up the KLs weigh less: latents are used before they cost much.
-        kl_weight = min(1.0, update / (args.kl_warmup * updates + 1))
+        kl_weight = min(1.0, update / (args.kl_warmup * updates + 1))  # kl_warmup 0: 1
         parts["loss"] = kl_weight * (parts["kl_z"] + parts["kl_c"]) - parts["rec"]
         optimizer.zero_grad()
         parts["loss"].backward()
         nn.utils.clip_grad_value_(model.parameters(), 0.5)  # [code] entry by entry
         optimizer.step()
         losses.append({key: round(value.item(), 5) for key, value in parts.items()})
-        if update % max(1, updates // 10) == 0:
+        if update % 100 == 0:
             tqdm.write(f"update {update} of {updates}: {losses[-1]}")
     return losses
 
@@ -689,32 +690,28 @@ def train(args: Args) -> Path:
     choose("split", args.split, getattr(module, "SPLITS", ("default",)))
     if args.batch_observations > args.observations:
         raise UserError(f"an update cannot use more than the {args.observations} observations")
-    if max(args.updates, args.epochs) < 1:
-        raise UserError("updates and epochs are both 0: nothing would be trained")
-    # CREATE's no-op is in no part of a split, for it is always available; but it is recorded,
-    # learned and encoded like every other action (A.3).
+    if (args.updates > 0) == (args.epochs > 0):
+        raise UserError("either updates or epochs must be above 0, and the other one 0")
+    if args.compact_lstm and args.hidden % 2:
+        raise UserError("compact_lstm halves hidden, which must be even")
+    # CREATE's no-op, always available, is in no part of a split, but an action like others (A.3).
     split = module.split_actions(args.split, args.split_seed)
-    parts = np.concatenate(list(split.values()))
+    parts = np.concatenate(list(split.values())).astype(int)  # [] alone would be float
     if len(np.unique(parts)) < len(parts):
         raise UserError(f"the parts of split {args.split!r} overlap")
-    no_op = getattr(module, "NO_OP", parts[:0])
+    no_op = getattr(module, "NO_OP", parts[:0])  # or none
     shown = parts if args.train_on == "all" else split["train"]
     action_pool = np.union1d(no_op, parts)
     train_ids = np.union1d(no_op, shown)
     data = observe(module, action_pool, args)
     if args.device == "auto":
         args = replace(args, device="cuda" if torch.cuda.is_available() else "cpu")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # networks are small: a second thread waits more than it works
-    try:
-        with torch.random.fork_rng():  # the caller's random numbers stay as they are
-            torch.manual_seed(args.seed)
-            architecture = HVAE if args.hierarchical else VAE
-            model = architecture(args, data.shape[2:]).to(args.device)
-            losses = fit(model, data, np.searchsorted(action_pool, train_ids), args)
-            table = embed(model, data, action_pool, args)
-    finally:
-        torch.set_num_threads(threads)
+    with torch.random.fork_rng():  # the caller's random numbers stay as they are
+        torch.manual_seed(args.seed)
+        architecture = HVAE if args.hierarchical else VAE
+        model = architecture(args, data.shape[2:]).to(args.device)
+        losses = fit(model, data, np.searchsorted(action_pool, train_ids), args)  # ids -> rows
+        table = embed(model, data, action_pool, args)
     path = representation_path(args)
     head = ",".join(losses[0])
     rows = [list(row.values()) for row in losses]
@@ -739,7 +736,9 @@ def check_table(path, mean, module):
     # UserError unless a table has a row of finite numbers for every action.
     number = module.NUM_ACTIONS
     if mean.ndim != 2 or len(mean) != number or not np.isfinite(mean).all():
-        raise UserError(f"{path}: mean must be finite and ({number}, D), got {mean.shape}")
+        raise UserError(
+            f"{path}: mean must be finite (training diverged?) and ({number}, D), got {mean.shape}"
+        )
 
 
 def action_set(module):
@@ -779,8 +778,9 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
     except Exception as error:  # archives, arrays and JSON each have errors of their own
         raise UserError(f"{path} is missing or no file of representations") from error
     # A table of your own that names no split belongs to every split.
-    names = dict(env=environment_name(env), action_set=action_set(module))
-    wanted = names | dict(split=split, split_seed=split_seed)
+    wanted = dict(
+        env=environment_name(env), action_set=action_set(module), split=split, split_seed=split_seed
+    )
     for key, value in wanted.items():
         if config.get(key, value) != value:
             raise UserError(f"{path} has {key} {config[key]!r}, wanted {value!r}: make it again")
@@ -790,7 +790,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
     return dict(mean=mean, action_ids=action_ids, config=config)
 
 
-def probe(mean, train_ids, held_out_ids, env="gridworld") -> dict[str, float]:
+def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     """What a table tells: read-outs fitted on training actions, scored on held-out ones."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
@@ -808,7 +808,7 @@ def probe(mean, train_ids, held_out_ids, env="gridworld") -> dict[str, float]:
     # The authors' tables, released with [code], score, in this order, 0.946, 0.604, 0.717 (HVAE);
     # 0.970, 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
     scores = {}
-    if env == "gridworld":
+    if environment_name(env) == "gridworld":
         net = features[:, :2]  # columns 0-1 are the net displacement (x, y), each in -5..5
         logistic = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000))
         scores["net_r2"] = score(ridge, net)
@@ -829,7 +829,7 @@ def probe(mean, train_ids, held_out_ids, env="gridworld") -> dict[str, float]:
 
 def report(path, table, split, args):
     # Scores on the held-out actions: one line, <name>.json, and the t-SNE picture.
-    held_out = np.concatenate([split["valid"], split["test"]])
+    held_out = np.concatenate([split["valid"], split["test"]]).astype(int)
     if len(held_out) < 3:
         print("fewer than 3 held-out actions: no scores, no picture")
         return
@@ -837,23 +837,23 @@ def report(path, table, split, args):
     print(f"{len(held_out)} held-out actions: {scores}")
     write(path.with_suffix(".json"), lambda file: file.write(json.dumps(scores).encode()))
     labels = np.asarray(load_environment(args.env).action_labels())
-    plot_tsne(table[held_out], labels[held_out], path.with_name(f"{path.stem}-tsne.png"), path.stem)
+    plot_tsne(table[held_out], labels[held_out], path.with_name(f"{path.stem}-tsne.png"))
 
 
-def plot_tsne(mean, labels, path, title):
+def plot_tsne(mean, labels, path):
     """Figures 4-6: representations (count, D) by t-SNE, one colour per label."""
     from matplotlib.figure import Figure
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
     tsne = TSNE(perplexity=min(10, len(mean) - 1), init="pca", random_state=0)  # [code] 10
-    with threadpool_limits(1):  # on a busy machine several threads mostly wait for each other
+    with threadpool_limits(1):  # several threads took 40 s, not 4, on two busy cores
         places = tsne.fit_transform(mean)  # (count, 2)
     names, classes = np.unique(labels, return_inverse=True)
     figure = Figure(figsize=(7, 5), layout="constrained")
     axes = figure.subplots()
     points = axes.scatter(*places.T, s=22, c=classes, cmap="gist_rainbow")
-    axes.set(xticks=[], yticks=[], frame_on=False, title=title)
+    axes.set(xticks=[], yticks=[], frame_on=False, title=path.stem)
     figure.legend(points.legend_elements(num=None)[0], names, loc="outside right")
     write(path, lambda file: figure.savefig(file, dpi=120))
 
@@ -861,8 +861,7 @@ def plot_tsne(mean, labels, path, title):
 def parse_args(words: list[str]) -> Args:
     """Args of a command line; --help shows the numbers of *its* environment and recipe."""
     # Three words decide the defaults, so it is read twice. "" stands for the first modality.
-    first = default_args("gridworld")
-    first.modality = ""
+    first = replace(default_args("gridworld"), modality="")
     first = tyro.cli(Args, args=[w for w in words if w not in ("-h", "--help")], default=first)
     default = default_args(first.env, first.recipe, first.modality)
     return tyro.cli(Args, args=words, default=default, description=__doc__)
@@ -870,6 +869,7 @@ def parse_args(words: list[str]) -> Args:
 
 def main(words: list[str]) -> None:
     """Train what the command line says; a mistake of the user ends it with one sentence."""
+    torch.set_num_threads(1)  # networks are small: a second thread waits more than it works
     try:
         print(f"representations: {train(parse_args(words))}")
     except UserError as error:

@@ -5,7 +5,7 @@ This one reads a *representation* c_i of every action, a vector that hvae.py mak
 of what the action does. A utility function f_nu gives one number to a pair of state and action, and
 a softmax turns the numbers of the available actions into probabilities:
 
-    pi(a_i | s, A) = exp f_nu(c_i, f_omega(s)) / sum_{j in A} exp f_nu(c_j, f_omega(s))
+    pi(a_i | s) = exp f_nu(c_i, f_omega(s)) / sum of exp f_nu(c_j, f_omega(s)) over available a_j
 
 A new action is then just another vector. The policy must not learn the training actions by heart,
 so there are three regularisers, marked *so* below: *subsampling*, every episode has its own random
@@ -14,7 +14,7 @@ one that does best with actions held out for this choice.
 
 Baselines: `nearest-neighbor` has an output per training action and executes the available action
 nearest to the one it drew; `continuous` draws a point in the space of representations and executes
-the available action nearest to it; `--representation vae` takes a VAE without hierarchy (B).
+the available action nearest to it; `--representation vae` takes a VAE without hierarchy.
 Ablations: `--ent-coef 0`, `--no-subsample`. Appendix C: C.1 `--task`; C.2 `--finetune`, `--adapt`;
 C.3 `--no-subgoal-reward`; C.4 `--aux-conditioned`; C.5 `--fully-observable`; C.6 `--placement`,
 `--split full`; C.7 curve.png of every run. A.3's analyses: `create --split analysis
@@ -105,9 +105,9 @@ class Args:
     fully_observable: bool = False  # Recommender: representations hold the popularity, too (C.5)
 
     # --- action representations ---
-    # hvae-all is an encoder that was trained on all actions (the oracle); vae is B's baseline.
+    # hvae-all: an encoder that was trained on all actions (the oracle); vae: appendix B's baseline.
     representation: str = "hvae"  # hvae, hvae-all, vae, engineered[-5d], or a table FILE.npz
-    modality: str | None = None  # what the encoder sees (B): xy, video, ...; None: the first
+    modality: str | None = None  # what the encoder sees: xy, video, ...; None: its usual
     hvae_recipe: Literal["quick", "fast", "paper"] = "fast"  # how long the encoder is trained
 
     # --- which actions are available ---
@@ -224,7 +224,7 @@ FAST = {
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # as in CREATE
         minibatch_size=32,  # physics is the cost, so learn more from each step
-        clip_vloss=False,  # as in CREATE
+        clip_vloss=False,  # heights, too, are large against clip_coef
         total_timesteps=400_000,
         eval_every=20_500,
     ),
@@ -281,6 +281,22 @@ def sum_over_all(x):
         dist.all_reduce(x)
 
 
+# ---- random numbers ----
+
+# What random numbers are for. Each use has a stream of its own, so that, for example, a longer
+# evaluation does not change the training.
+TRAINING = 1  # training environments
+TORCH = 2  # PyTorch's draws while training
+VALIDATION = 3  # evaluations while training
+TEST = 4  # the final test
+COMMAND = 5  # the command `evaluate`
+
+
+def seeds(n, *stream):
+    """`n` seeds of one stream, named by the run's seed, its use, and more; all are independent."""
+    return np.random.SeedSequence(stream).generate_state(n).tolist()
+
+
 # ---- D.3.2: the networks ----
 
 
@@ -313,11 +329,11 @@ def cnn(frames, H, small):
     layers = []
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
-        if small:  # [code] keeps PyTorch's weights: all pictures give nearly the same output
+        if small:  # [code] keeps PyTorch's weights, with which all pictures look nearly the same
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # so that it does not matter how many lines are drawn, only where
+    if small:  # features grow with the number of lines in the picture; only their places matter
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -487,7 +503,7 @@ class Agent(nn.Module):
         piece = max(1, 800_000 // (available.shape[1] * code.shape[1]))
         logits = []
         for states, ids in zip(state_part.split(piece), available.split(piece), strict=True):
-            actions = action_part.index_select(0, ids.flatten())  # (b * K, H)
+            actions = action_part.index_select(0, ids.flatten())  # faster than [ids]; (b * K, H)
             hidden = states[:, None] + actions.unflatten(0, ids.shape)  # (b, 1, H) + (b, K, H)
             logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
         return torch.cat(logits) + self.utility_out.bias
@@ -506,8 +522,9 @@ class Agent(nn.Module):
         if self.args.method == "utility":
             return drawn
         # A baseline takes the available action nearest to the training action, or to the point,
-        # that was drawn. This belongs to the environment: no gradient passes. (While
-        # nearest-neighbor is trained, all training actions are available, so it gets what it drew.)
+        # that was drawn. The loss needs only the probability of what was drawn; what follows is
+        # like a part of the environment. (While nearest-neighbor is trained, all training actions
+        # are available, so it gets what it drew.)
         if self.args.method == "nearest-neighbor":
             drawn = self.table[self.train_ids[drawn]]  # (B,) -> (B, D)
         difference = self.table[available] - drawn[:, None]  # (B, K, D) - (B, 1, D)
@@ -538,11 +555,11 @@ class Agent(nn.Module):
         if self.args.method == "continuous":
             # D numbers were drawn. [code] adds up their entropies in Grid World and averages them
             # elsewhere; [here] the mean, so that ent_coef means the same for every D.
-            logprob = logprob.sum(1).clamp(-1e5, 1e5)  # [code]: keeps ratios finite
+            logprob = logprob.sum(1).clamp(-1e5, 1e5)  # [code]: infinite ones differ by NaN
             entropy = entropy.mean(1)
 
         # Where to place it: a Beta distribution for each dimension (D.3.2). With parameters above 1
-        # it has one peak, and never one at each border.
+        # it has a single peak.
         if "position" in self.action_parts:
             x = code
             if self.args.aux_conditioned:  # C.4
@@ -651,8 +668,11 @@ def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
     return advantages
 
 
-def discounted_returns(rewards, dones, G, gamma):
-    """G <- gamma G + r, step by step: all of them (T, N), and the G to go on with (N,)."""
+def running_returns(rewards, dones, G, gamma):
+    """Discounted sums of *past* rewards, of which only the spread is used (NormalizeReward).
+
+    G <- gamma G + r at every step, 0 after an episode. All G (T, N), and the last to go on with.
+    """
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
         G = gamma * G + rewards[t]
@@ -665,8 +685,7 @@ def ppo_loss(agent, mb, ent_coef):
     """PPO's clipped loss of one minibatch, and the numbers of it that go into metrics.csv."""
     # How much likelier is each action now than when it was played?
     args = agent.args
-    action = {name: mb[name] for name in ("drawn", "action_id", *agent.action_parts)}
-    _, logprob, entropy, value = agent.act(mb["state"], mb["available"], action)
+    _, logprob, entropy, value = agent.act(mb["state"], mb["available"], action=mb)
     logratio = logprob - mb["logprob"]
     ratio = logratio.exp()
 
@@ -719,18 +738,19 @@ def update(agent, optimizer, batch, ent_coef):
 
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
-    # Which actions are available in which phase, and their representations. If there is no table
-    # yet, rank 0 trains the encoder while the others wait.
+    # A phase is a pair: the pool of actions, and the number K of them that is available. "learn" is
+    # what the policy is trained with; it is scored in "train" (the same actions) and "valid".
     check(args)
     phases, train_ids = action_phases(args)
-    mine = (claim_folder(args), load_table(args)) if RANK == 0 else None
-    folder, table = gather_from_all(mine)[0]
+    # Rank 0 makes the run's folder and, if there is no table of representations yet, trains the
+    # encoder. All others wait here, and receive both.
+    made = (claim_folder(args), load_table(args)) if RANK == 0 else None
+    folder, table = gather_from_all(made)[0]
 
-    # Environments, networks, optimiser. Environments draw from other streams of random numbers than
-    # weights and actions do.
+    # Environments, networks, optimiser.
     device = choose_device(args)
     N = args.num_envs // WORLD_SIZE
-    envs, _ = make_envs(args, phases["learn"], N, (args.seed, 1))
+    envs, _ = make_envs(args, phases["learn"], N, (args.seed, TRAINING))
     torch.manual_seed(args.seed)
     agent = Agent(envs, table, train_ids, args).to(device)
     if args.finetune:
@@ -744,7 +764,7 @@ def train(args):
     step = 0
     seconds = 0.0
     best_score = -math.inf
-    log_size = 0  # of metrics.csv, in bytes
+    log_size = 0  # bytes of metrics.csv; what comes after the checkpoint is cut off
     if args.resume and path.exists():
         checkpoint = load(path)
         put(checkpoint, path, **learned)
@@ -762,9 +782,9 @@ def train(args):
             # At the beginning and after every checkpoint, all random numbers and all episodes start
             # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
             # Episodes still running are cut off; GAE has taken V of their last state for the rest.
-            torch.manual_seed(seeds(1, args.seed, 2, step, RANK)[0])
-            obs, _ = envs.reset(seed=seeds(N, args.seed, 1, step, RANK))
-            G = torch.zeros(N, device=device)  # discounted return of each environment so far
+            torch.manual_seed(seeds(1, args.seed, TORCH, step, RANK)[0])
+            obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
+            G = torch.zeros(N, device=device)  # see running_returns
 
         # The learning rate falls linearly (D.2), to a tenth [code]. So may the entropy bonus
         # [here]: exploring is wanted early; late in training a random action can cost the episode.
@@ -779,11 +799,11 @@ def train(args):
         # has to read the representations. (--no-subsample: K is all of them.)
         batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
 
-        # Judge. Rewards are divided by the standard deviation of the discounted return, so that
-        # values have one size in all environments. [code] does not do so with pictures.
+        # Judge. Rewards are divided by the standard deviation of a running return, so that values
+        # have one size in all environments, and clipped [code]. Not so with pictures [code].
         rewards = batch["reward"]
         if not agent.is_image:
-            returns, G = discounted_returns(rewards, batch["done"], G, args.gamma)
+            returns, G = running_returns(rewards, batch["done"], G, args.gamma)
             reward_stats.update(returns.flatten())
             rewards = (rewards / reward_stats.mean_std()[1]).clamp(-10, 10)
         with torch.no_grad():
@@ -804,15 +824,13 @@ def train(args):
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
         # with actions which neither encoder nor policy was trained on. Test actions are not looked
-        # at before the end. (The best of many noisy scores is a bit too good; the test is not. A
-        # policy that adapts, C.2, has only the actions it adapts to.)
+        # at before the end: the best of many noisy scores is a bit too good, the test is not.
         is_checkpoint = step % eval_steps == 0 or step == last_step
-        train_score = None
-        valid_score = None
+        train_score = valid_score = None
         if is_checkpoint and RANK == 0:
-            stream = (args.seed, 3, step)
+            stream = (args.seed, VALIDATION, step)
             train_score = evaluate(agent, phases["train"], args.valid_episodes, stream)["score"]
-            valid_score = train_score
+            valid_score = train_score  # C.2 has no actions but those that it adapts to
             if not args.adapt:
                 valid_score = evaluate(agent, phases["valid"], args.valid_episodes, stream)["score"]
             if valid_score > best_score:
@@ -886,20 +904,13 @@ OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}
 ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
 
 
-def seeds(n, *stream):
-    """`n` seeds of one stream of random numbers, independent of all other streams."""
-    # A stream is named by the run's seed and by what it is for: 1 training environments, 2 PyTorch,
-    # 3 evaluations while training, 4 the final test, 5 the command `evaluate`.
-    return np.random.SeedSequence(stream).generate_state(n).tolist()
-
-
 def task_options(args):
     """The options of this environment's make_vec."""
     return {name: getattr(args, name) for name in OPTIONS.get(args.env, ())}
 
 
 def with_no_op(action_pool, args):
-    """The pool and CREATE's no-op (A.3), which is available in every episode [code]."""
+    """The pool and CREATE's no-op (A.3): in every episode one of the K [code], in no pool."""
     no_op = getattr(hvae.load_environment(args.env), "NO_OP", None)
     return action_pool if no_op is None else np.union1d(action_pool, [no_op])
 
@@ -928,20 +939,23 @@ def action_phases(args):
 
     # "learn": the policy is trained; "train": it is scored on the same actions; "valid": selects
     # the checkpoint; "test": scored once, at the end. K random actions of the pool are available in
-    # an episode: num_available in "learn", eval_available elsewhere. Three cases learn with a fixed
-    # set instead, all of it available all the time, and "train" scores them on it: nearest
-    # neighbour (which has an output per action), the ablation without subsampling, and C.2.
+    # an episode: num_available in "learn", eval_available elsewhere.
     action_pool = split["test"] if args.adapt else split["train"]
-    K = args.num_available
-    eval_K = args.eval_available or K
+    learn_K = args.num_available
+    eval_K = args.eval_available or learn_K
     train_K = eval_K
+    # Three cases learn with a fixed set instead, and "train" scores them on it: nearest neighbour,
+    # the ablation without subsampling, and C.2. All of the set is available all the time. [code]
+    # makes it smaller where the utility of every action would cost too much; the outputs of nearest
+    # neighbour are cheap.
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
             size = min(args.fixed_set_size, len(action_pool))
             action_pool = np.sort(rng.choice(action_pool, size, replace=False))
-        K = train_K = len(with_no_op(action_pool, args))
-    phases = {"learn": (action_pool, K), "train": (action_pool, train_K)}
+        learn_K = len(with_no_op(action_pool, args))
+        train_K = learn_K
+    phases = {"learn": (action_pool, learn_K), "train": (action_pool, train_K)}
     if not args.adapt:
         phases.update(valid=(split["valid"], eval_K), test=(split["test"], eval_K))
     for phase in phases.values():
@@ -1028,11 +1042,12 @@ def check(args):
         raise UserError(f"{args.finetune} is not the folder of a finished run")
     # A rollout is cut into whole steps of all environments, and into equal shares of processes.
     size = args.minibatch_size * args.num_minibatches
-    if size % args.num_envs or args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
+    if size % args.num_envs:
         raise UserError(f"num_envs {args.num_envs} must divide the {size} steps of a rollout")
+    if args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
+        raise UserError(f"{WORLD_SIZE} processes must divide num_envs and minibatch_size")
     if not 2 <= size <= args.total_timesteps:
         raise UserError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
-    action_phases(args)
 
 
 # ---- the run's folder ----
@@ -1046,7 +1061,7 @@ def run_name_of(args):
     name = args.run_name
     if name is None:
         usual = vars(default_args(args.env, args.recipe, args.quick))
-        usual.update(recipe="fast", quick=False)
+        usual.update(recipe="fast", quick=False)  # so that these two are named themselves
         words = [hvae.environment_name(args.env)]
         for option, value in vars(args).items():
             if value != usual[option] and option not in ("seed", *FREE):
@@ -1064,8 +1079,8 @@ def claim_folder(args):
     """
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
-    # Two processes in one folder would mix their rows. A lock of the operating system ends with its
-    # process, however that ends.
+    # Two processes in one folder would mix their rows. The operating system ends a lock with its
+    # process, however that ends; Python would end it with the variable, so atexit keeps it.
     lock = FileLock(folder / ".lock", is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -1143,7 +1158,6 @@ class Log:
         self.bar.update(row["step"] - self.bar.n)
         if row["train_score"] is not None:
             scores = "seen {train_score:.3f}, validation {valid_score:.3f}".format(**row)
-            self.bar.set_postfix_str(scores)
             self.bar.write(f"step {row['step']:,}: {scores}")
         return self.path.stat().st_size
 
@@ -1162,7 +1176,7 @@ def finish(folder, agent, phases, step, seconds):
     results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
     tested = {name: phase for name, phase in phases.items() if name in TESTED}
     for name, phase in tested.items():
-        results[name] = evaluate(agent, phase, args.eval_episodes, (args.seed, 4))
+        results[name] = evaluate(agent, phase, args.eval_episodes, (args.seed, TEST))
     write_json(folder / "results.json", results)
 
     print(f"\n{metric}, mean and standard error of {args.eval_episodes} episodes")
@@ -1170,7 +1184,7 @@ def finish(folder, agent, phases, step, seconds):
         print("{:10} {score:7.3f} +- {stderr:.3f}".format(TESTED[name], **results[name]))
     try:  # whatever goes wrong with a picture, the results are safe
         plot_curve(folder, metric)
-        record_episode(agent, phase, folder / "episode.gif")  # of the last phase: unseen actions
+        record_episode(agent, phases["train" if args.adapt else "test"], folder / "episode.gif")
     except Exception as e:
         print(f"note: a picture is missing: {type(e).__name__}: {e}")
     print(f"curve, episode, metrics and checkpoints: {folder}")
@@ -1282,7 +1296,7 @@ def evaluate_run(options):
     check_number(phase, args)
 
     # The policy as it was trained, but with other actions: that is all of Algorithm 2.
-    stream = (args.seed, 5)
+    stream = (args.seed, COMMAND)
     envs, _ = make_envs(args, phase, 1, stream)
     agent = Agent(envs, best["agent"]["table"].numpy(), train_ids, args)
     envs.close()
@@ -1294,7 +1308,8 @@ def evaluate_run(options):
     if options.save:
         # `best_step` tells which checkpoint was scored: an unfinished run may still find a better.
         row = dict(vars(options), num_available=K, pool_size=len(pool), **result)
-        append_row(folder / "evaluations.csv", row | {"best_step": best["step"]})
+        row["best_step"] = best["step"]
+        append_row(folder / "evaluations.csv", row)
     if options.gif:
         record_episode(agent, phase, Path(options.gif))
         print(f"episode: {options.gif}")

@@ -219,7 +219,9 @@ def check_04(path):
     table = hvae.load_representation(path, "gridworld")["mean"]
     expect(table.shape == (1024, 2), "two numbers for each of 1,024 skills", table.shape)
     split = gridworld.split_actions()
-    scores = hvae.probe(table, split["train"], np.union1d(split["valid"], split["test"]))
+    scores = hvae.probe(
+        table, split["train"], np.union1d(split["valid"], split["test"]), "gridworld"
+    )
     expected = "net_r2 above 0.99 (are differences of uint8 taken as such? 3 - 5 makes 254)"
     expect(scores["net_r2"] > 0.99, expected, scores["net_r2"])
     whole = (table == table.round()).all()
@@ -402,7 +404,7 @@ def check_12(hvae):
     table = rng.normal(3.0, 0.3, (1024, 8))  # says little, around 3
     table[:, :3] = module.engineered_representations()[:, :3]  # says something
     table[split["train"], 3] *= rng.uniform(size=512)  # of training skills alone
-    scores = hvae.probe(table, split["train"], held_out)
+    scores = hvae.probe(table, split["train"], held_out, "gridworld")
     if "dims_in_use" not in scores:
         raise Wrong("not begun: probe has no score dims_in_use")
     expected = "3 dimensions in use (standard deviation above 0.5 over the held-out actions)"

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pymunk
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from PIL import ImageColor
 from pymunk import Vec2d
 
 import create_env as c
@@ -94,49 +93,30 @@ def physics_of(tool: Tool) -> tuple:
     aimed = kind.contact in (c.CANNON, c.FAN, c.FUNNEL, c.BUCKET)
     what = (*corners, shape.elasticity, shape.friction, shape.collision_type, shape.radius)
     more = (tool.max_angle, tool.mass, tool.left_up, tool.force, tool.speed, tool.angle * aimed)
-    return (*what, *more, tool.damping * (kind.shape == "plank"))
+    return (*what, *more, tool.damping * (kind.contact == c.PLANK))
 
 
 def test_no_two_tools_are_one_tool_so_no_split_has_a_twin_on_both_sides():
     assert len({physics_of(tool) for tool in c.TOOLS}) == len(c.TOOLS)
 
 
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10**6))
-def test_splits_have_the_papers_sizes_and_share_nothing(seed):
+@pytest.mark.parametrize("seed", [0, 1, 2, 10**6])
+def test_splits_have_the_papers_sizes_and_a_group_shares_no_angle(seed):
     sizes = {"default": [1097, 507, 506], "full": [938, 400, 399], "analysis": [761, 3397, 3397]}
     sizes["random"] = sizes["default"]
     assert sum(sizes["default"]) + 1 == 2111 and sum(sizes["full"]) + 2 == 1739  # with the no-op
     for split in c.SPLITS:
         parts = c.split_actions(split, seed)
         assert [len(ids) for ids in parts.values()] == sizes[split]
-        assert all(ids.dtype == np.int64 and (np.diff(ids) > 0).all() for ids in parts.values())
-        everything = np.concatenate(list(parts.values()))
-        assert len(np.unique(everything)) == len(everything) and c.NO_OP not in everything
-    with pytest.raises(ValueError, match="unknown split 'half'"):
-        c.split_actions("half")
-    parts, again, other = (c.split_actions("random", s) for s in (seed, seed, seed + 1))
-    assert np.array_equal(parts["train"], again["train"])
-    assert not np.array_equal(parts["train"], other["train"])
-    for split in ("default", "random"):  # training and held-out tools of a group share no angle
-        parts = c.split_actions(split, seed)
         held_out = np.concatenate([parts["valid"], parts["test"]])
-        for group, published in c.TRAINING_ANGLES.items():
+        groups = c.TRAINING_ANGLES if split in ("default", "random") else {}
+        for group, published in groups.items():
             ids = np.flatnonzero(np.isin(c.TOOL_KINDS, group))
             a = set(c.TOOL_ANGLES[np.intersect1d(ids, parts["train"])])
             b = set(c.TOOL_ANGLES[np.intersect1d(ids, held_out)])
             assert a and b and not a & b
-            assert split == "random" or a == set(published)
-
-
-def test_the_default_split_is_one_published_draw_and_its_seed_draws_the_halves():
-    first, second = c.split_actions(seed=0), c.split_actions(seed=1)
-    assert np.array_equal(first["train"], second["train"])
-    assert not np.array_equal(first["valid"], second["valid"])
-    # cannons of 120 to 180 degrees: held out, too
-    upper_left = [i for i, t in enumerate(c.TOOLS) if t.kind == "Cannon" and 120 <= t.angle <= 180]
-    assert [len(np.intersect1d(upper_left, first[part])) for part in first][0] == 14
-    assert all(len(np.intersect1d(upper_left, first[part])) > 3 for part in ("valid", "test"))
+            assert split == "random" or a == set(published)  # whatever the seed
+    assert not np.array_equal(*(c.split_actions("random", s)["train"] for s in (seed, seed + 1)))
 
 
 def test_angle_gaps_of_the_analysis_as_counted_class_by_class():
@@ -152,8 +132,7 @@ def test_angle_gaps_of_the_analysis_as_counted_class_by_class():
 
 def test_engineered_representations_are_standardised_as_published():
     features = c.engineered_representations()
-    assert features.shape == (c.NUM_ACTIONS, 30) and features.dtype == np.float32
-    assert (features[:, :21].sum(axis=1) == 1).all()
+    assert features.shape == (c.NUM_ACTIONS, 30) and (features[:, :21].sum(axis=1) == 1).all()
     coarse = features[c.IS_COARSE, 21:].astype(np.float64)
     assert np.allclose(coarse.mean(0), 0, atol=1e-5) and np.allclose(coarse.std(0), 1, 1e-4)
     # published means and deviations are over 2,366 tools: ours and 40 boxes of no split
@@ -167,38 +146,32 @@ def test_engineered_representations_are_standardised_as_published():
     assert np.allclose(numbers.std(axis=0), std, atol=6e-6)
 
 
-def test_a_new_class_is_one_line_of_the_table(tmp_path):
-    """The docstring's Octagon, written into a copy of the file."""
-    (line,) = re.findall(r'^    ("Octagon": .*)$', c.__doc__, re.M)
-    source, spot = SCRIPT.read_text(encoding="utf-8"), '    # level objects\n    "Target"'
-    assert source.count(spot) == 1
-    (tmp_path / "more_env.py").write_text(source.replace(spot, f"    {line}\n{spot}"), "utf-8")
+def test_a_new_class_is_the_docstrings_example(tmp_path):
+    """The docstring's Octagon, written into a copy of the file, and a class without a turn."""
+    source = SCRIPT.read_text(encoding="utf-8")
+    (example,) = re.findall(r"^    (OWN_KINDS = {.*)}$", c.__doc__, re.M)
+    more = example + ', "Vane": Kind("segment", ORANGE, vary={"angle": ANGLES, "size": (9,)})}'
+    assert source.count("\nOWN_KINDS = {}") == 1
+    source = source.replace("\nOWN_KINDS = {}", "\n" + more)
+    (tmp_path / "more_env.py").write_text(source, "utf-8")
     code = """
 import create_env as c, more_env as m, numpy as np
-assert [tuple(t) for t in m.TOOLS[:8359]] == [tuple(t) for t in c.TOOLS] and m.NUM_ACTIONS == 8422
+assert [tuple(t) for t in m.TOOLS[:8359]] == [tuple(t) for t in c.TOOLS]
+assert m.TOOL_KINDS[8359:].tolist() == 63 * ["Octagon"] + 24 * ["Vane"] and m.IS_COARSE[8359:].all()
 for split in c.SPLITS:  # no other tool changes its part
     old, now = c.split_actions(split, 3), m.split_actions(split, 3)
     assert all(np.array_equal(old[part], now[part][now[part] < 8359]) for part in old)
-    assert [int((ids >= 8359).sum()) for ids in now.values()] == [42, 11, 10]
-assert m.TOOL_CLASSES[-1] == "Octagon"
+    assert [int((ids >= 8359).sum()) for ids in now.values()] == [42 + 12, 11 + 6, 10 + 6]
+assert m.TOOL_CLASSES[-2:] == ("Octagon", "Vane")
 env = m.CreateEnv([8400], 2)
 env.reset(seed=0)
 env.step({"choice": 1, "position": (-0.2, 0.3)})
-assert env.placement == "placed" and m.engineered_representations().shape == (8422, 31)
+assert env.placement == "placed" and m.engineered_representations().shape == (8446, 32)
 assert m.action_labels()[8400] == "Octagon" and m.action_observations([8400], 2).any()
 """
     code = f"import sys; sys.path[:0] = {[str(tmp_path), str(SCRIPT.parent)]!r}" + code
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_friction_is_a_field_of_a_tool():
-    smooth, rough = Tool("Ramp", 0.5, size=22, friction=0), Tool("Ramp", 0.5, size=22)
-    spins = [
-        drop(t, (38.0, 47.5), (4.0, 0.0), steps=40)[2].body.angular_velocity
-        for t in (smooth, rough)
-    ]
-    assert abs(spins[0]) < 1e-9 and abs(spins[1]) > 0.1
 
 
 def test_a_new_task_is_the_docstrings_example(monkeypatch):
@@ -220,7 +193,6 @@ def test_a_new_task_is_the_docstrings_example(monkeypatch):
 def test_free_fall():
     for k, fallen in enumerate((1.733, 7.02, 15.87, 28.27), start=1):  # units after k actions
         y = drop(None, (42.0, 80.0), steps=40 * k)[2].body.position.y
-        assert 80 - y == pytest.approx(2 / 900 * (40 * k) * (40 * k - 1) / 2)
         assert 80 - y == pytest.approx(fallen, abs=0.02)
 
 
@@ -312,15 +284,15 @@ def test_see_saws_keep_their_limit_and_their_centre(kind):
 
 
 def test_levers_damp_a_ball_and_ball_tools_give_no_spin():
-    free, damped = (
-        drop(Tool("Lever", size=30, damping=d, friction=0), (42.0, 46.0), (3.0, 0.0), steps=30)[
-            2
-        ].body
-        for d in (1.0, 1.1)
-    )
-    assert free.velocity.x > 2.5 and damped.velocity.x < 0.5 * free.velocity.x
+    speeds = []
+    for damping in (1.0, 1.1):
+        lever = Tool("Lever", size=30, damping=damping, friction=0)
+        speeds.append(drop(lever, (42.0, 46.0), (3.0, 0.0), steps=30)[2].body.velocity.x)
+    assert speeds[0] > 2.5 and speeds[1] < 0.5 * speeds[0]
     ball = drop(c.TOOLS[find_tool("Ball", size=9)], (45.0, 58.0), steps=200)[2].body
     assert abs(ball.angular_velocity) < 1e-12 and ball.velocity.x > 0.5
+    rough = drop(Tool("Ramp", 0.5, size=22), (38.0, 47.5), (4.0, 0.0), steps=40)[2].body
+    assert abs(rough.angular_velocity) > 0.1  # friction gives spin
 
 
 # ---- the levels ----
@@ -328,28 +300,16 @@ def test_levers_damp_a_ball_and_ball_tools_give_no_spin():
 # Checksums of the 12 levels, which agree with a second typing of the published task files.
 # fmt: off
 LEVELS = {
-    "push": 3620504309, "obstacle": 2159674556, "seesaw": 2057828556, "navigate": 1860028674,
-    "belt": 2874315113, "buckets": 3871591672, "cannon": 1500383092, "collide": 4058077089,
-    "moving": 558698627, "ladder": 1588577226, "basket": 3585987640, "funnel": 4279850824,
+    "push": 3595548630, "obstacle": 1608373405, "seesaw": 2422318921, "navigate": 1437334511,
+    "belt": 401340954, "buckets": 537331048, "cannon": 2996579070, "collide": 837833832,
+    "moving": 575668800, "ladder": 156826117, "basket": 3118732433, "funnel": 4277749489,
 }
 # fmt: on
 
 
-def spelled(task: c.Task) -> str:
-    """A level in words: the numbers of every object, subgoals, shifts and rules."""
-    words = []
-    for one in (task.marker, task.target, task.goal, *task.items, *task.walls):
-        if one:
-            numbers = [one.x, one.y, *(number for number in one.tool[1:10] if number)]
-            words.append(" ".join([one.tool.kind, *(f"{number:g}" for number in numbers)]))
-    shifts = {name: np.broadcast_to(amount, 2).tolist() for name, amount in task.shifts.items()}
-    rules = (task.marker_must_hit, task.target_hit_reward, task.goal_on_either_side)
-    return "; ".join(map(str, (*words, task.subgoals, shifts, *rules, task.max_actions)))
-
-
 @pytest.mark.parametrize("task", LEVELS)
 def test_level_is_the_published_one(task):
-    level = spelled(c.TASKS[task])
+    level = repr(c.TASKS[task])
     assert zlib.crc32(level.encode()) == LEVELS[task], f"{task} is no longer as published: {level}"
 
 
@@ -433,19 +393,14 @@ def test_outcomes_and_their_rewards():
         assert (env.placement, paid) == (outcome, pytest.approx(reward))
 
 
-def touch_goal(env: CreateEnv) -> tuple:
-    """Put the target beside the goal and act."""
-    move_ball(env._target, *(env._goal.place + (7.0, 2.0)))
-    return env.step(WAIT)
-
-
 @pytest.mark.parametrize(
     "task, paid, reward",
     [("collide", True, 10.01), ("push", True, 11.01), ("push", False, 10.01)],
 )
 def test_goal_pays_ten_and_ends_and_in_push_the_target_hit_pays_with_it(task, paid, reward):
     env = fixed_env(task, subgoal_reward=paid)
-    assert touch_goal(env)[1:] == (pytest.approx(reward), True, False, {"success": 1.0})
+    move_ball(env._target, *(env._goal.place + (7.0, 2.0)))
+    assert env.step(WAIT)[1:] == (pytest.approx(reward), True, False, {"success": 1.0})
 
 
 @pytest.mark.parametrize("stays", [False, True])
@@ -507,39 +462,40 @@ def test_time_limit_truncates_and_balls_that_leave_terminate():
 class SlowCanvas:
     """The obvious picture without Pillow: which of a pixel's 25 points are in which shape?"""
 
+    in_colour = False
+
     def __init__(self, fine: int = 5):
         at = (np.arange(84 * fine) + 0.5) / fine
         self.points = at[None, :] + 1j * at[::-1, None]  # row 0 is the top
         self.image = np.full(self.points.shape, 255.0)
 
-    def polygon(self, corners, paint):
+    def polygon(self, corners, colour):
         z = [complex(*corner) for corner in corners]
         sides = [((self.points - a) / (b - a)).imag for a, b in zip(z, z[1:] + z[:1], strict=True)]
         inside = np.all(np.array(sides) >= 0, axis=0) | np.all(np.array(sides) <= 0, axis=0)
-        self.image[inside] = paint.grey
+        self.image[inside] = ImageColor.getcolor(colour, "L")
 
-    def line(self, points, width, paint, edge=0):
+    def line(self, points, width, colour):
         z = [complex(*point) for point in points]
         for a, b in zip(z, z[1:] or z, strict=False):
             along = np.clip(((self.points - a) / (b - a or 1)).real, 0, 1)
-            self.image[np.abs(self.points - a - along * (b - a)) <= width / 2] = paint.grey
-
-    def disc(self, centre, radius, paint, edge=0):
-        self.line([centre], 2 * radius, paint)
+            near = np.abs(self.points - a - along * (b - a)) <= width / 2
+            self.image[near] = ImageColor.getcolor(colour, "L")
 
 
 @pytest.mark.parametrize("task", list(c.TASKS))
 def test_picture_equals_the_slow_obvious_one(task):
-    env, rng = CreateEnv(range(c.NUM_ACTIONS), 50, task=task), np.random.default_rng(0)
+    env = CreateEnv(range(c.NUM_ACTIONS), 50, task=task)
     env.reset(seed=4)
-    over, actions = False, 0
-    while not over and actions < 8:
-        action = {"choice": int(rng.integers(50)), "position": rng.uniform(-1, 1, 2)}
-        observation, _, terminated, truncated, _ = env.step(action)
-        over, actions = terminated or truncated, actions + 1
+    env.action_space.seed(1)
+    for _ in range(8):
+        observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            break
     slow = SlowCanvas()
     for thing in sorted(env._objects, key=lambda thing: thing.body is not None):
-        c.draw(slow, thing.tool, *thing.pose())
+        now = (thing.body.position, thing.body.angle) if thing.body else (thing.place,)
+        c.draw(slow, thing.tool, *now)
     slow = slow.image.reshape(84, 5, 84, 5).mean(axis=(1, 3))
     error = np.abs(observation["state"][-1] - slow)  # thin lines: a third of a unit
     assert error.mean() < 2 and (error > 100).mean() < 0.004
@@ -556,6 +512,8 @@ def test_frames_are_stacked_newest_last_after_black_upright_and_not_mirrored():
     second = env.step(WAIT)[0]["state"]
     assert np.array_equal(second[1], first[2]) and not np.array_equal(second[2], second[1])
     assert not first[:2].any()  # earlier arrays are left alone
+    second[2] = 7
+    assert env.step(WAIT)[0]["state"][1].max() == 255  # and what is done to them has no effect
 
 
 @pytest.mark.parametrize("colour", [False, True])
@@ -579,34 +537,15 @@ def test_pictures_show_scene_and_state_side_by_side():
     assert np.abs(frames[-1][:420, -140:, 0].mean() - state.mean()) < 1
 
 
-def test_captions_tell_a_refused_tool_in_red_and_a_goal_in_green():
-    env = fixed_env("collide", find_tool("Ramp"), render_mode="rgb_array")
-    for act, wanted in ((lambda: env.step({"choice": 1, "position": (0.0, 0.25)}), "red"),
-                        (lambda: touch_goal(env), "green")):  # fmt: skip
-        act()
-        red, green, blue = env.render()[425:, :420].astype(int).transpose(2, 0, 1)
-        seen = {
-            "red": (red - green > 90).any(),
-            "green": (green - np.maximum(red, blue) > 50).any(),
-        }
-        assert seen[wanted] and sum(seen.values()) == 1
-
-
-@pytest.mark.parametrize("part", ["train", "valid", "test"])
-def test_the_no_op_and_k_minus_1_tools_are_on_offer_in_every_pool(part):
-    pool = c.split_actions()[part]
+def test_the_no_op_and_k_minus_1_tools_are_available():
+    pool = c.split_actions()["valid"]
     env, seen = CreateEnv(pool, 50), set()
     for seed in range(60):
         available = env.reset(seed=seed)[0]["available"]
-        assert available[0] == c.NO_OP and available.dtype == np.int64
-        assert len(set(available)) == 50 and set(available[1:]) <= set(pool)
-        seen |= set(available)
-    assert len(seen) > 0.9 * len(pool)
-    whole = CreateEnv(pool[::-1], len(pool) + 1)  # nothing to draw: sorted
-    assert whole.reset(seed=1)[0]["available"].tolist() == [0, *pool]
-    assert np.array_equal(CreateEnv([0, *pool], len(pool) + 1).action_pool, pool)
-    with pytest.raises(ValueError, match=f"available actions out of a pool of {len(pool) + 1}"):
-        CreateEnv(pool, len(pool) + 2)
+        assert available[0] == c.NO_OP and len(set(available)) == 50
+        seen |= set(available[1:])
+    assert seen <= set(pool) and len(seen) > 0.9 * len(pool)
+    assert CreateEnv([0, *pool]).action_pool.tolist() == pool.tolist()
 
 
 def test_bad_arguments_and_actions_change_nothing():
@@ -618,9 +557,8 @@ def test_bad_arguments_and_actions_change_nothing():
         with pytest.raises(ValueError, match="choice|position"):
             env.step({"choice": choice, "position": position})
     np.testing.assert_equal(env.step(WAIT), clean.step(WAIT))
-    for arguments in ({"task": "pull"}, {"render_mode": "human"}):
-        with pytest.raises(ValueError, match="unknown"):
-            CreateEnv(**arguments)
+    with pytest.raises(ValueError, match="unknown task 'pull'; allowed: push, "):
+        CreateEnv(task="pull")
 
 
 # pytest turns what a contact rule raises into a warning
@@ -641,9 +579,8 @@ def test_five_thousand_random_steps():
             if terminated or truncated:  # no lost or leaked parts, no NaN
                 space, parts = env._space, sum(len(thing.parts) for thing in env._objects)
                 assert len(space.bodies) + len(space.constraints) + len(space.shapes) == parts
-                assert np.isfinite(
-                    [(*at, angle) for at, angle in map(SceneObject.pose, env._objects)]
-                ).all()
+                bodies = [thing.body for thing in env._objects if thing.body]
+                assert np.isfinite([(*body.position, body.angle) for body in bodies]).all()
                 env.reset()
     assert all(placed[kind] > 20 for kind in KINDS[1:]), placed
 
@@ -664,16 +601,8 @@ PUBLISHED = {
     + [pytest.param(task, 2000, marks=pytest.mark.slow) for task in c.TASKS],
 )
 def test_random_success_and_no_op_length_as_published(task, episodes):
-    env, rng, hits = CreateEnv(task=task), np.random.default_rng(2), 0.0
-    env.reset(seed=2)
-    for _ in range(episodes):
-        over = False
-        while not over:
-            action = {"choice": int(rng.integers(50)), "position": rng.uniform(-1, 1, 2)}
-            *_, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-        hits += info["success"]
-        env.reset()
+    env = CreateEnv(task=task)
+    hits = sum(c.play_episode(env, seed)[2] for seed in range(episodes))
     success, length = PUBLISHED[task]
     pooled = (hits + success * 20 + 1) / (episodes + 2002)  # published: 2,000 episodes
     error = math.sqrt(pooled * (1 - pooled) * (1 / episodes + 1 / 2000))
@@ -728,19 +657,14 @@ def test_probe_trajectories_meet_the_tool(kind):
     assert (distance.min(axis=1) < 0.75).mean() > 0.95
 
 
-def test_observation_bytes_depend_on_seed_tool_and_number_only(capfd):
+def test_observations_of_all_modalities_are_of_the_same_scenes(capfd):
     ids = [5, 1500, 900, 2050]
-    for modality in c.MODALITIES:
-        both = c.action_observations(ids, 3, modality, seed=4, workers=2)
-        for row, action in enumerate(ids):
-            assert np.array_equal(c.action_observations([action], 3, modality, 4)[0], both[row])
-    states = c.action_observations(ids, 3, "state", seed=4)
+    states = c.action_observations(ids, 3, "state", seed=4, workers=2)
     assert np.array_equal(states[..., 2:4], c.action_observations(ids, 3, seed=4))
-    assert not np.array_equal(c.action_observations(ids, 3, seed=5), states[..., 2:4])
+    assert not np.array_equal(states[..., 2:4], c.action_observations(ids, 3, seed=5))
     assert capfd.readouterr().err == ""  # no bar where nobody watches
-    for arguments in (([-1], 4), ([0.5], 4), ([1], 0), ([1], 4, "sound")):
-        with pytest.raises(ValueError):
-            c.action_observations(*arguments)
+    with pytest.raises(ValueError, match="0 observations, must be at least 1"):
+        c.action_observations([1], 0)
 
 
 def test_videos_show_the_scenes_of_the_states():
@@ -767,52 +691,48 @@ def test_play_follows_mouse_and_keys_without_a_display(monkeypatch):
 
     def events() -> None:
         figure = plt.gcf()
-        strip, scene = figure.axes
+        menu, scene = figure.axes
 
-        def send(axes=None, x=0, y=0) -> tuple[int, str]:
-            """A click, or a press of the space bar; how far the episode is then."""
-            x, y = scene.transData.transform((x, y)) if axes is scene else (x, y)
-            x, y = strip.transData.transform((x, y)) if axes is strip else (x, y)
-            event = MouseEvent("button_press_event", figure.canvas, x, y, 1)
-            event = event if axes else KeyEvent("key_press_event", figure.canvas, " ")
+        def send(event) -> tuple[int, str]:
             figure.canvas.callbacks.process(event.name, event)
             return env._actions, env.placement
 
+        def click(axes, x, y) -> tuple[int, str]:
+            x, y = axes.transData.transform((x, y))
+            return send(MouseEvent("button_press_event", figure.canvas, x, y, 1))
+
+        space = KeyEvent("key_press_event", figure.canvas, " ")
         figure.canvas.draw()
-        assert send(scene, 150, 170) == (1, "waited")  # the no-op is chosen at first
-        assert send(strip, 0.5, 1.5) == (1, "waited")
-        assert strip.get_title() == f"chosen: {c.TOOLS[env.available[2]].kind}"
-        assert send(scene, 150, 170) == (2, "placed")
+        assert click(scene, 150, 440) == (0, "waited")  # the caption
+        assert click(scene, 500, 170) == (0, "waited")  # the policy's pictures
+        assert click(scene, 150, 170) == (1, "waited")  # the no-op is chosen at first
+        assert click(menu, 0.5, 1.5) == (1, "waited")
+        assert menu.get_title() == f"chosen: {c.TOOLS[env.available[2]].kind}"
+        assert click(scene, 150, 170) == (2, "placed")
         assert env._centres == [pytest.approx([150 / 210 - 1, 1 - 170 / 210])]
-        assert send() == (3, "waited")
         env._actions = 29
-        assert send() == (30, "waited") and env._over  # the end stays in view
-        assert send() == (0, "waited") and not env._over  # the next episode
+        assert send(space) == (30, "waited") and env._over  # the end stays in view
+        assert send(space) == (0, "waited") and not env._over  # the next episode
+        assert menu.get_title() == "chosen: No-op"
 
     monkeypatch.setattr(plt, "show", events)
     c.play(env)
     plt.close("all")
 
 
-def test_the_sheet_of_tasks_has_every_task(monkeypatch):
-    monkeypatch.setattr(c, "TASKS", c.TASKS | {"mine": c.TASKS["push"]})
-    titles = [axes.get_title() for axes in c.tasks_sheet().axes]
-    assert titles[0] == "(a) push" and titles[12:] == ["(m) mine"]
-
-
 @pytest.mark.parametrize(
     "arguments, files",
     [
         ("--tries 3 --task moving --tools Fan Funnel", {"create_moving.gif"}),
-        ("--all-tasks --show-tools", {"create_tasks.png", "create_tools.png"}),
-        ("--show-probe --tools Bucket", {"create_probe.png"}),
+        ("--sheet tasks", {"create_tasks.png"}),
+        ("--sheet tools", {"create_tools.png"}),
+        ("--sheet probe --tools Bucket", {"create_probe.png"}),
         ("--task pull", None),
         ("--tools Spoon", None),
         ("--tries 0", None),
     ],
 )
-def test_command_draws_or_says_what_is_wrong(arguments, files, tmp_path, monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "module://no_such_backend")  # an inherited one ends nothing
+def test_command_draws_or_says_what_is_wrong(arguments, files, tmp_path):
     command = [sys.executable, SCRIPT, *arguments.split(), "--out", tmp_path / "new"]
     done = subprocess.run(command, capture_output=True, text=True)
     if files is None:

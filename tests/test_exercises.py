@@ -63,7 +63,7 @@ CHANGES = {
                 "agent.noisy_table = agent.table  #": "#",
                 "action=None):": "action=None, clean=False):\n        self.clean = clean\n",
                 "self.noisy_table[": "(self.table if self.clean else self.noisy_table)[",
-                "linear(self.noisy_table,": "linear([self.noisy_table, self.table][self.clean],",
+                "r(self.noisy_table,": "r(self.table if self.clean else self.noisy_table,",
                 "def play_step(envs, obs, agent": "def play_step(envs, obs, agent, clean=False",
                 "act(state, available)": "act(state, available, clean=clean)",
                 " _, obs, infos = play_step(": " _, obs, infos = play_step(clean=True, ",

@@ -224,7 +224,7 @@ def test_running_statistics_equal_those_of_all_data_at_once():
 
 
 # ---- PPO's arithmetic ----
-def test_gae_and_discounted_returns_equal_their_definitions():
+def test_gae_and_running_returns_equal_their_definitions():
     r, v, nv = (torch.randn(s, dtype=torch.float64) for s in ((9, 3), (9, 3), (3,)))
     d = (torch.rand(9, 3) < 0.3).double()
 
@@ -239,8 +239,8 @@ def test_gae_and_discounted_returns_equal_their_definitions():
         return r[t, n] + (0.9 * (1 - d[t - 1, n]) * so_far(t - 1, n) if t else 0.0)
 
     advantages = ppo.gae(r, v, d, nv, 0.9, 0.8)
-    first, G = ppo.discounted_returns(r[:4], d[:4], torch.zeros(3), 0.9)
-    second, _ = ppo.discounted_returns(r[4:], d[4:], G, 0.9)  # goes on with the next rollout
+    first, G = ppo.running_returns(r[:4], d[:4], torch.zeros(3), 0.9)
+    second, _ = ppo.running_returns(r[4:], d[4:], G, 0.9)  # goes on with the next rollout
     returns = torch.cat([first, second])
     for t, n in np.ndindex(9, 3):
         assert math.isclose(advantages[t, n], slow(t, n), abs_tol=1e-12)

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -107,7 +108,8 @@ def run(folder: Path, words: str) -> str:
 def test_example_of_an_own_environment_learns_unseen_actions(tmp_path):
     dial = ROOT / "exercises/dial.py"
     blocks = re.findall(r"```python\n(.*?)```", TEXT, re.S)
-    assert any(block in dial.read_text("utf-8") for block in blocks)  # its core
+    core = [textwrap.indent(block, "    ") for block in blocks]
+    assert any(block in dial.read_text("utf-8") for block in core)
     words = "--representation engineered --total-timesteps 20480 --eval-episodes 300"
     run(tmp_path, f"{dial} {words} --run-name dial")
     folder = tmp_path / "runs/dial"
@@ -130,7 +132,7 @@ def test_example_of_an_own_action_encoder_is_accepted_by_the_policy(tmp_path):
     subprocess.run([sys.executable, "encode.py"], cwd=tmp_path, env=environment, check=True)
     table = hvae.load_representation(tmp_path / "endpoints.npz", "gridworld")
     ids = gridworld.split_actions()
-    assert hvae.probe(table["mean"], ids["train"], ids["test"])["move_accuracy"] > 0.99
+    assert hvae.probe(table["mean"], ids["train"], ids["test"], "gridworld")["move_accuracy"] > 0.99
     words = "--representation endpoints.npz --minibatch-size 64 --total-timesteps 512"
     run(tmp_path, f"gridworld {words} --eval-episodes 8 --valid-episodes 8 --run-name own")
     results = json.loads((tmp_path / "runs/own/results.json").read_text())
