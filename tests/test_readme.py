@@ -107,9 +107,9 @@ def run(folder: Path, words: str) -> str:
 
 def test_example_of_an_own_environment_learns_unseen_actions(tmp_path):
     dial = ROOT / "exercises/dial.py"
-    blocks = re.findall(r"```python\n(.*?)```", TEXT, re.S)
-    core = [textwrap.indent(block, "    ") for block in blocks]
-    assert any(block in dial.read_text("utf-8") for block in core)
+    (core,) = re.findall(r"```python\n(def reset.*?)```", TEXT, re.S)
+    for function in core.split("\n\n\n"):
+        assert textwrap.indent(function, "    ") in dial.read_text(encoding="utf-8")
     words = "--representation engineered --total-timesteps 20480 --eval-episodes 300"
     run(tmp_path, f"{dial} {words} --run-name dial")
     folder = tmp_path / "runs/dial"
