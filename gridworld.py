@@ -109,10 +109,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
-    """`ids` as a sorted int64 array (m,).
-
-    ValueError unless they are distinct, known, and m >= num_available >= 1.
-    """
+    """`ids`, sorted, int64 (m,); ValueError unless distinct, known, and m >= num_available >= 1."""
     ids = np.sort(np.asarray(ids))
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
@@ -431,10 +428,7 @@ def draw_sheet(path: Path, skills: np.ndarray, seed: int) -> None:
 
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
-    """Write pictures (h, w, 3) uint8 as a GIF that rests on its last picture.
-
-    The file appears whole or not at all.
-    """
+    """Write pictures (h, w, 3) uint8 as a GIF that rests on its last one; all of it or no file."""
     data = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
     durations = [round(1000 / fps)] * len(pictures)  # ms

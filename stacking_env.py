@@ -2,8 +2,8 @@
 
 Two cylinders stand on a table. An action names one of 20 available shapes and the place above which
 it is let go, and the physics (pybullet) decides what stays up. The score is the height of the
-highest shape when the agent stops or has acted ten times. At test time the available shapes have
-sizes (or classes) never used in training, so the agent must understand pictures of them.
+highest centre of mass (not top) when the agent stops or has acted ten times. At test time the sizes
+(or classes) of the shapes were never used in training: the agent must understand their pictures.
 
                        __
                       |__|     <- let go 0.02 above everything, at the x the agent chose
@@ -29,7 +29,8 @@ Paper map (appendix -> here):
     Table 3 (20 actions, 10)      NUM_AVAILABLE, MAX_STEPS
 
 Two marks in the comments: [code] is the authors' released implementation (with another physics
-engine, MuJoCo), used where the appendix is silent; [here] is a choice of this repository.
+engine, MuJoCo), [here] is a choice of this repository. Alone, [code] marks what is taken over where
+the appendix is silent; in "[code] has ...; [here] ..." it is replaced.
 """
 
 import colorsys
@@ -67,11 +68,10 @@ except ModuleNotFoundError:
     raise error(sentence) from None
 
 # Read by the other files. In each tuple the first entry is the default.
-METRIC = "height"  # m, of the highest shape at the end of an episode
+METRIC = "height"  # m above the table, of the highest centre of mass at the end of an episode
 MODALITIES = ("image",)  # A.4: "images of the shape from various camera angles and heights"
 SPLITS = ("default", "full")  # A.4
-# C.6, Figure 13: No Place, 1D Place (the default) and 2D Place, by how many coordinates of the
-# place the agent decides.
+# C.6, Figure 13: how many coordinates of the place the agent decides. The default is 1D Place.
 PLACEMENTS = {"none": 0, "1d": 1, "2d": 2}
 
 # ---- rules of the game (A.4) ----
@@ -83,7 +83,7 @@ FRAMES = 4  # A.4: "stack past 4 frames"
 SIZE = 84  # A.4: "84x84 grayscale image"
 DROP_GAP = 0.02  # m [here]: A.4 has a "soft drop"; the shapes are .16 to 1.92 m wide
 # A scene starts with two copies of one of these, "at random locations on a line" (A.4), here x.
-CYLINDERS = (798, 799, 800)  # [code]: ids of shapes
+CYLINDERS = (798, 799, 800)  # [code]: ids in SHAPES, with radii of .33, .34 and .36 m
 CENTRE = (-0.2, 0.2)  # m [code]: x of the middle between the two
 AXIS_GAP = (1.0, 1.6)  # m [code]: from one axis to the other
 
@@ -93,18 +93,19 @@ SIM_STEPS = 300  # A.4: "acts every 300 physics simulator steps"
 # inertia of its form, because large ratios break Bullet's solver: five cubes, each larger than the
 # one below, fall within 3 s with masses by density and stand with mass 1.
 MASS = 1.0
-# Friction between two bodies: [code] has 2 (sliding), 2 (spinning) and .25 (rolling), which is
-# close to glue; [here] 1, .1 and .05, because spheres then come to rest, but the class of a shape
-# still decides what can stand on it. A body has half of the last two, because Bullet adds up those
-# of the two bodies; the sliding coefficients it multiplies. [code] Nothing bounces.
+# Friction between two bodies: [code] has 2 (sliding), 2 (spinning about the contact normal) and .25
+# (rolling), which is close to glue; [here] 1, .1 and .05, because spheres then come to rest, but
+# the class of a shape still decides what can stand on it. From the values of one body, below,
+# Bullet makes those of a pair: 1 x 1, .05 + .05 and .025 + .025. [code] Nothing bounces.
 CONTACT = dict(lateralFriction=1.0, spinningFriction=0.05, rollingFriction=0.025, restitution=0)
 # A.4 always simulates 300 steps; [here] only until all is at rest. This is not only a saving but a
 # part of the task: in the steps that are left out, small errors of the solver would shear a tower
-# apart that already stands. At rest means: at two checks in a row, five steps apart, every velocity
-# is below REST_SPEED, and no two bodies overlap by REST_DEPTH or more.
+# apart that already stands. `greedy_plan` reaches a mean height of 5.3 this way, and 4.7 with all
+# 300 steps; random play is as high either way. At rest means: at two checks in a row, five steps
+# apart, every velocity is below REST_SPEED, and no two bodies overlap by REST_DEPTH or more.
 CHECK_EVERY = 5  # simulation steps
 CHECKS_IN_A_ROW = 2
-REST_SPEED = 0.05  # m/s, and 1/s for angular velocities
+REST_SPEED = 0.05  # m/s, and rad/s for angular velocities; of each component
 REST_DEPTH = 0.01  # m; an eighth of the thinnest shape
 
 # ---- pictures ----
@@ -113,9 +114,7 @@ REST_DEPTH = 0.01  # m; an eighth of the thinnest shape
 # does not see the top of a higher tower.
 FRONT = ((0.0, -7.0, 2.5), (0.0, 0.0, 2.5))
 RAISED = ((0.0, -4.0, 5.5), (0.0, 1.66, 0.0))  # for 2D Place, where depth matters
-# Action observations are taken from anywhere on a band around the shape, that of [code]. The
-# longest shapes do not fit in: 38 of the 810 (arches, slabs and lying boxes of more than 1.5 m) are
-# cut off at the edge in a third to nine tenths of their views.
+# Action observations are taken from a band around the shape [code]; 38 long shapes do not fit in.
 VIEW_RADIUS = 2.0  # m
 VIEW_HEIGHT = (0.5, 2.0)  # m
 # [here] The light comes from over the photographer's right shoulder: (right, up, back), of length
@@ -126,7 +125,7 @@ WOOD = (0.82, 0.66, 0.45)  # [here] the lit table is 120 of 255 in grey (2D Plac
 # For people, all [here]: the colour pictures of `render`, and of GIFs while a shape falls.
 COLOUR_SIZE = 336  # pixels
 COLOUR_CAMERA = ((0.0, -12.8, 5.7), (0.0, 0.0, 4.35))  # up to a height of 9.5, more than any tower
-FRAME_EVERY = 20  # simulation steps per picture; at 10 a second, twice as fast as real
+FRAME_EVERY = 20  # simulation steps from picture to picture: .2 s, which a GIF shows in .1 s
 
 
 # ---- A.4: the 810 shapes ----
@@ -150,16 +149,17 @@ def ring(count: int, z: float, radius: float = 1.0) -> np.ndarray:
 class Family:
     """Shapes that differ in scale and in the angle about the vertical; all combinations occur.
 
-    One family of [code] or several make a class of A.4. `bullet_type` is what Bullet lets collide:
-    the convex hull of the points (MESH), boxes of eight points each, or a round solid that Bullet
-    knows by a formula; of that the points are a fine net.
+    A class of A.4 consists of one or more of these families; families are [code]'s unit. What
+    collides is, by `bullet_type`: the convex hull of `points` (MESH), boxes of eight points each,
+    or a round solid, which Bullet computes exactly; its `points` only sample the surface, for
+    drawing and for `top`.
     """
 
     name: str  # [code]
-    points: np.ndarray  # (V, 3) at scale 1, about the origin: the point that is put at a place
+    points: np.ndarray  # (V, 3) at scale 1, from the shape's origin, which is what gets a place
     scales: tuple  # the smallest, the largest, how many
     num_angles: int = 1
-    turn: float = 0  # degrees; the angles divide it evenly, from 0 on, without `turn` itself
+    turn: float = 0  # degrees: `num_angles` equally spaced angles in [0, turn)
     label: str = ""  # its class in Table 2, where that is not the name
     bullet_type: int = p.GEOM_MESH
     moments: tuple = ()  # of inertia about x, y, z at scale 1 and mass 1; only of a round solid
@@ -173,7 +173,8 @@ class Family:
 
 # [code] A dome is half a cylinder that lies: half a circle in x and z, its flat side at z = -.5.
 HALF_CIRCLE = [(math.cos(a), math.sin(a) - 0.5) for a in np.linspace(0, math.pi, 13)]
-# A hat is a right-angled prism on its longest side; x and y swap, so that its ridge is along x.
+# A hat is a right-angled prism on its longest side; x and y swap, so that its ridge is along x. It
+# is scaled by sqrt 2, so that its short sides are 2 long, as those of `triangle`: one solid.
 HAT = prism((-1, 0), (1, 0), (0, 1))[:, [1, 0, 2]] * (1, math.sqrt(2), math.sqrt(2))
 CONE = np.vstack([ring(20, -1), (0, 0, 1)])
 # [code] draws a round tunnel through a block, but lets the full block collide; [here] the tunnel is
@@ -189,10 +190,12 @@ CAPSULE = np.vstack([BALL + (0, 0, 1), BALL - (0, 0, 1)])
 CYLINDER = np.vstack([ring(32, 1), ring(32, -1)])
 
 # A.4: "varying the scale and vertical orientation in each shape class". The scales and angles are
-# those of [code], but for one family: `rectangle` has a square footprint, so [code]'s six angles in
-# half a turn show every shape twice; [here] they divide a quarter turn, because A.4 wants the
-# shapes different. [code] has the cone twice, as two meshes; kept for the count of 810. The moments
-# of a capsule add up those of its tube, with 3/5 of the mass, and of a half-ball at either end.
+# those of [code], except for `rectangle`: its footprint is a square, so [code]'s six angles in half
+# a turn show every shape twice; [here] they divide a quarter turn, because A.4 wants the shapes
+# different. Cube and pyramid repeat after 90 degrees, of which [code] uses only the first 45; kept.
+# [code] has the cone twice, as two meshes; kept for the count of 810. To A.4's ten classes Table 2
+# adds "angled" triangles and rectangles: the families of the two that [code] keeps for the test in
+# the Full Split. The moments of a capsule: its tube (3/5 of the mass) and half a ball at each end.
 FAMILIES = (
     Family("middle_triangle", points=prism((-1, -1), (1, -1), (0, 1)),
            scales=(0.1, 0.5, 6), num_angles=10, turn=180, label="angled-triangle"),
@@ -208,7 +211,7 @@ FAMILIES = (
            scales=(0.2, 0.6, 6), num_angles=10, turn=180),
     Family("cone-hires", points=CONE, same_as="cone", scales=(0.1, 0.6, 30), label="cone"),
     Family("cone", points=CONE, scales=(0.1, 0.6, 30)),
-    Family("tetrahedron", points=PYRAMID,  # [code] on a square
+    Family("tetrahedron", points=PYRAMID,  # [code] calls it that; it is a pyramid on a square
            scales=(0.1, 0.6, 10), num_angles=6, turn=45),
     Family("arch", points=ARCH, bullet_type=p.GEOM_BOX,
            scales=(0.1, 0.5, 6), num_angles=10, turn=180),
@@ -234,7 +237,7 @@ class Shape(NamedTuple):
 
     family: Family
     scale: float  # m
-    angle: float  # about the vertical, radians
+    angle: float  # about the vertical, radians; the recordings do not tell it, see `_views`
 
     def solid_key(self) -> tuple:
         """(name, scale), equal for two shapes that are one solid, on whatever face they lie."""
@@ -271,29 +274,28 @@ def mass_properties(family: Family) -> tuple:
     shares = volumes / volumes.sum()
     com = shares @ tetrahedra.mean(axis=1)  # (T,) @ (T, 3) -> (3,)
     # The inertia matrix is trace(m) I - m, where m is the mean of x x^T over the solid, x counted
-    # from the centre of mass. Over one tetrahedron with the corners v this mean is known to be
-    # (sum of v v^T + (sum of v) (sum of v)^T) / 20.
+    # from the centre of mass. A point of a tetrahedron is a weighted mean of the corners v. Over
+    # all points, a squared weight has the mean 2/20 and the product of two weights 1/20, so x x^T
+    # has the mean (sum of v v^T + (sum of v) (sum of v)^T) / 20.
     corners = tetrahedra - com
     total = corners.sum(axis=1)  # (T, 3)
     m = np.einsum("t,tvi,tvj->ij", shares, corners, corners)
     m = (m + np.einsum("t,ti,tj->ij", shares, total, total)) / 20
     inertia = np.trace(m) * np.eye(3) - m  # (3, 3)
-    # Bullet wants the axes about which this matrix is diagonal. These are x, y and z, but for
-    # `triangle` and `tall_triangle`.
+    # Bullet wants the principal axes, about which this matrix is diagonal: x, y and z, except for
+    # `triangle` and `tall_triangle`. Returned is a Rotation from the body's frame, which lies along
+    # these axes, to the shape's own frame.
     diagonal = np.diag(inertia)
     if np.allclose(inertia, np.diag(diagonal), atol=1e-9):
         return com, Rotation.identity(), diagonal
     principal, axes = np.linalg.eigh(inertia)
-    axes *= np.linalg.det(axes)  # a rotation, not a mirror image
+    axes *= np.linalg.det(axes)  # det is +-1; in 3-D, flipping all three axes makes it +1
     return com, Rotation.from_matrix(axes), principal
 
 
 # ---- A.4: ids, labels, features, split ----
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
-    """`ids` as a sorted int64 array (m,).
-
-    ValueError unless they are distinct, known, and m >= num_available >= 1.
-    """
+    """`ids`, sorted, int64 (m,); ValueError unless distinct, known, and m >= num_available >= 1."""
     ids = np.sort(np.asarray(ids))
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
@@ -312,9 +314,9 @@ def action_labels() -> np.ndarray:
 def engineered_representations() -> np.ndarray:
     """Ground truth: scale, sin and cos of the angle, one-hot family; (NUM_ACTIONS, 19) float32."""
     # [code] gives the angle itself (and an axis, always vertical); [here] a point on the circle, so
-    # that a turn by almost 360 degrees is close to none. Of a family whose shape repeats after 180
-    # or 90 degrees, the angles end before that: no shape has two rows. Yet a box at 162 degrees
-    # looks much like one at 0, and their rows are far apart; so they are in [code].
+    # that 350 degrees is close to 0. Angles stop before the form repeats, so no form appears twice
+    # within a family. Known flaw, as in [code]: a box at 162 degrees looks much like one at 0, but
+    # their rows are far apart.
     table = np.zeros((NUM_ACTIONS, 3 + len(FAMILIES)), dtype=np.float32)
     for row, shape in zip(table, SHAPES, strict=True):
         row[:3] = (shape.scale, math.sin(shape.angle), math.cos(shape.angle))
@@ -337,28 +339,32 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
     # training shape of its family; all angles of a scale stay together. [code] draws per family;
     # [here] families of one solid share their draws, because else a cone would be in training and
-    # its copy, the other cone, in the test. So do hat and triangle, and both smallest rectangles.
-    drawn = set()
-    train_solids = set()
+    # its copy, the other cone, in the test. So do hat and triangle; `rectangle` and
+    # `horizontal_rectangle` share only their smallest scale. Go through the families, and draw as
+    # many undecided sizes for training as are missing to half of the family.
+    drawn = set()  # solids that are decided, for either side
+    train_solids = set()  # those of them that are for training
     for family in FAMILIES:
         solids = [shape.solid_key() for shape in SHAPES if shape.family is family]
         solids = list(dict.fromkeys(solids))  # each once
         undrawn = [solid for solid in solids if solid not in drawn]
-        # Half of the solids are wanted; earlier families may have put some of them in training.
+        # Earlier families have put some of its solids in training: half, if they share all scales,
+        # else at most one. So `missing` is never negative.
         missing = len(solids) // 2 - len(train_solids.intersection(solids))
         order = rng.permutation(len(undrawn))
         train_solids.update(undrawn[k] for k in order[:missing])
         drawn.update(solids)
     train = np.array([shape.solid_key() in train_solids for shape in SHAPES])
 
-    # Full Split (Table 2): the class alone decides, in place of the draw. (The draw is made all the
-    # same: the halves below, on which results/ rests, come after it in the stream of numbers.) One
-    # solid can be on both sides: a `hat` is a `triangle` that lies on another face.
+    # Full Split (Table 2): the class alone decides. The draw above is thrown away here, but still
+    # made: it advances `rng`; without it the halves would differ from those behind the stored
+    # results. One solid can be on both sides: a `hat` is a `triangle` on another face.
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
     # A.4: "randomly splitting the test set into half". Shapes of one solid and one angle stay
-    # together, so that the two cones do; other angles of a solid may be on both sides.
+    # together as a group, so the two cones do; other angles of a solid may be on both sides. The
+    # groups are dealt in random order: to validation until it has its half, the others to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
     for shape_id in unseen:
@@ -375,22 +381,23 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 # ---- what Bullet simulates and draws ----
 class Bullet:
-    """A simulation of its own: pybullet's functions, with its number already filled in."""
+    """One simulation: pybullet's functions, with the simulation's number already filled in."""
 
     def __init__(self) -> None:
         self.client = p.connect(p.DIRECT)  # without a window
-        weakref.finalize(self, p.disconnect, self.client)  # it ends when nobody holds it any more
+        weakref.finalize(self, p.disconnect, self.client)  # when nobody holds `self` any more
 
     def __getattr__(self, name: str) -> Any:
-        # Python comes here for what the object has not itself, for example `stepSimulation`.
+        # Python calls this for a name that the object lacks, for example `stepSimulation`.
         return functools.partial(getattr(p, name), physicsClientId=self.client)
 
 
 @functools.cache
 def geometry(family: Family) -> tuple:
     """What Bullet gets of a family, at scale 1: its V corners, and T triangles for the pictures."""
-    # pybullet never frees a list of vertices that it was given. So the lists of a family are made
-    # once, and `meshScale` gives the size: with new lists, an episode would leak 200 kB and more.
+    # pybullet never gives back its reference to a list of vertices. The same list again costs
+    # nothing, but new lists would leak 200 kB and more per episode. So the lists of a family are
+    # made once, and `meshScale` gives the size.
     vertices = []
     normals = []
     for part in family.parts():
@@ -408,7 +415,7 @@ def geometry(family: Family) -> tuple:
 
 
 def add_shape(bullet: Bullet, shape_id: int, origin: tuple, rgb: tuple) -> int:
-    """Put an upright shape's origin at a place in the world; returns Bullet's number of it."""
+    """Put an upright shape's origin at a place in the world; returns the body's Bullet number."""
     family, scale, angle = SHAPES[shape_id]
     corners, triangles = geometry(family)
     size = [scale] * 3
@@ -427,9 +434,8 @@ def add_shape(bullet: Bullet, shape_id: int, origin: tuple, rgb: tuple) -> int:
     else:  # height: of the straight part; a sphere has none
         collision = bullet.createCollisionShape(family.bullet_type, radius=scale, height=2 * scale)
 
-    # What is drawn, and the body itself. Its frame is at the centre of mass and goes along the
-    # principal axes: this is the pose that Bullet tells later. `origin` and `angle` are of the
-    # shape's own frame.
+    # What is drawn, and the body itself. Bullet later tells the pose of the body's frame (centre of
+    # mass, principal axes); `origin` and `angle` are of the shape's own frame.
     rgba = (*rgb, 1)
     visual = bullet.createVisualShape(p.GEOM_MESH, **triangles, meshScale=size, rgbaColor=rgba)
     com, axes, moments = mass_properties(family)
@@ -495,9 +501,9 @@ def grey(rgb: np.ndarray) -> np.ndarray:
 
 # ---- A.4: the environment ----
 def eq4_reward(heights: np.ndarray) -> float:
-    """Eq. 4 at the end of an episode, from the heights h_i of all N shapes in the scene (N,)."""
+    """Eq. 4 at the end of an episode, from the heights h_i (of centres of mass) of all N shapes."""
     # A.4 counts all N shapes in the scene, so the two cylinders as well; [code] averages only over
-    # shapes whose origin is above .5 m, and measures them .5 m lower.
+    # shapes whose origin is above .5 m, and subtracts .5 m from each.
     return float(LAMBDA_TOP * heights.max() + LAMBDA_AVG * heights.mean())
 
 
@@ -512,7 +518,7 @@ class StackingEnv(gym.Env):
     ## Action Space
     | key of the `Dict` | space | meaning |
     |---|---|---|
-    | choice | `Discrete(K)` | position in `available` of the shape to drop |
+    | choice | `Discrete(K)` | index into `available`: the shape to drop |
     | position | `Box(-1, 1, (d,))` | where, in m: x (1d), x and y (2d); no such key for "none" |
     | stop | `Discrete(2)` | 1: end the episode now, nothing is placed |
 
@@ -530,9 +536,9 @@ class StackingEnv(gym.Env):
     of all shapes, the cylinders included. Heights, in m, are of centres of mass above the table.
 
     ## Episode End
-    1. Termination: the stop action. 2. Truncation: the tenth action, repeats included. The last
-    step's info has `height`, that of the highest shape. `action_space.sample()` stops in every
-    second step; a random policy that does not:
+    1. Termination: the stop action. 2. Truncation: the tenth action, repeats included; an end like
+    the other, with the reward. The last step's info has `height`, that of the highest shape.
+    `action_space.sample()` stops with probability 1/2 at each step; a policy that never stops:
 
     >>> env = StackingEnv()
     >>> obs, info = env.reset(seed=0)
@@ -542,8 +548,7 @@ class StackingEnv(gym.Env):
     ## Arguments
     action_pool: ids to draw from (default: the training split); num_available: K; render_mode: None
     or "rgb_array"; placement: "none" (always over the centre), "1d" or "2d" (C.6); early_stop:
-    False runs the full 300 steps after each drop, as A.4 has it. ValueError for an unknown option,
-    for unknown or repeated ids, for a pool smaller than K.
+    False runs the full 300 steps after each drop, as A.4 has it. ValueError for bad arguments.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -622,8 +627,7 @@ class StackingEnv(gym.Env):
         if self._over:
             raise gym.error.ResetNeeded("no episode is running: call reset() before step()")
 
-        # Read the action. What is wrong with it, a missing key included, is said before anything
-        # moves; a place beyond [-1, 1] is not wrong, it only uses up the step (below).
+        # Read the action. What is wrong with it, a missing key too, is said before anything moves.
         choice = operator.index(action.get("choice", -1))
         stop = operator.index(action.get("stop", -1))
         position = np.asarray(action.get("position", ()), dtype=float)  # (d,)
@@ -634,17 +638,18 @@ class StackingEnv(gym.Env):
         self._steps += 1
         self._frames = []
 
-        # A.4: "If a shape has already been placed, trying to place it again does nothing." The two
-        # cylinders do not count. [here] Nor does a place beyond [-1, 1], which an unclipped
-        # Gaussian policy may ask for, do anything.
+        # A.4: "If a shape has already been placed, trying to place it again does nothing." The
+        # starting cylinders may have the id of an available shape, which can still be placed.
+        # [here] A place beyond [-1, 1], which an unclipped Gaussian policy may ask for, also does
+        # nothing: clipped, it would be a place that the policy did not choose.
         shape_id = self.available[choice]
         placed = shape_id in self.shape_ids[2:]
         inside = (np.abs(position) <= 1).all()
         drops = not stop and not placed and inside
 
-        # Drop the shape and wait until the scene has settled. What the agent does not decide of the
-        # place is 0. C.6: No Place is over the centre; in 1D Place "the y-coordinate of the drop
-        # is fixed to the center". [code] What may still move is halted first.
+        # Drop the shape and wait until the scene has settled. Coordinates that the agent does not
+        # decide are 0, the centre of the table (C.6). [code] What still moves, because 300 steps
+        # were not enough, is halted first; it makes no measurable difference.
         if drops:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
@@ -653,13 +658,16 @@ class StackingEnv(gym.Env):
             self._drop(shape_id, *place.tolist(), self.top(), COLOURS[shape_id])
             self._settle()
 
-        # The episode ends where the agent says so, and after ten actions.
+        # The episode ends where the agent says so, and after ten actions. [here] the limit is
+        # `truncated`, gymnasium's word for an end that only a clock makes; [code] makes no
+        # difference, nor does ppo_actiongen.py: it bootstraps after neither.
         terminated = bool(stop)
         truncated = not terminated and self._steps >= MAX_STEPS
         self._over = terminated or truncated
 
-        # Pay only at the end (Eq. 4: "1_Done"). [code] scores by the origins of the shapes; [here]
-        # by their centres of mass, because the reward and the score should mean the same height.
+        # Pay only at the end (Eq. 4: "1_Done"). A.4 leaves open what the height of a shape is: in
+        # [code] that of its origin (the middle of a cube, but the bottom of a hat); [here] that of
+        # its centre of mass, which means the same for every family.
         reward = 0.0
         info = {}
         if self._over:
@@ -694,11 +702,10 @@ class StackingEnv(gym.Env):
         """Is every velocity and angular velocity below REST_SPEED, and nothing inside another?"""
         for body in reversed(self._bodies):  # the newest moves most
             linear, angular = self._bullet.getBaseVelocity(body)
-            if max(map(abs, linear + angular)) >= REST_SPEED:
+            if max(map(abs, linear + angular)) >= REST_SPEED:  # two tuples in a row: six numbers
                 return False
-        # A thin shape can enter the table in the step in which it hits it. Bullet then pushes it
-        # out too slowly to count as moving. Of a contact, number 8 is the distance of the two
-        # bodies, below 0 if they overlap.
+        # A thin shape can enter the table when it hits it. Bullet pushes it out too slowly to count
+        # as moving. contact[8] is the distance of the two bodies, below 0 if they overlap.
         return all(contact[8] > -REST_DEPTH for contact in self._bullet.getContactPoints())
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
@@ -712,8 +719,8 @@ class StackingEnv(gym.Env):
         """Height of the highest point of the scene; of what is round, within .01 m."""
         highest = 0.0
         for shape_id, centre, rotation in zip(self.shape_ids, *self.poses(), strict=True):
-            # How far do the shape's points reach upwards? The last row of `rotation` is the world's
-            # z axis in the frame of the body; `axes` takes it on to that of the points.
+            # Turn the world's "up" into the shape's own frame, where `points` are given: world ->
+            # body (the last row of `rotation`) -> shape (`axes`). How far do they reach that way?
             family, scale, _ = SHAPES[shape_id]
             com, axes, _ = mass_properties(family)
             up = axes.apply(rotation[2])  # (3,)
@@ -722,7 +729,7 @@ class StackingEnv(gym.Env):
         return highest
 
     def _observe(self) -> dict:
-        """A.4 State: push a new picture onto the stack of four."""
+        """A.4 State: push a picture onto the stack of four, an equal one if nothing was placed."""
         camera = RAISED if self.placement == "2d" else FRONT
         picture = grey(photograph(self._bullet, camera))
         self._stack = np.concatenate([self._stack[1:], picture[None]])  # (4, 84, 84)
@@ -764,11 +771,12 @@ def make_vec(
     **options: Any,
 ) -> gym.vector.VectorEnv:
     """`num_envs` environments in a process each, with independent streams; see StackingEnv."""
-    # Processes, because the physics of a step takes 8 ms. SAME_STEP: an episode that ends is
-    # followed by the next one in the same step.
+    # Processes, because the physics of a step takes 8 ms. SAME_STEP, because then no step is lost
+    # between two episodes; what the ended one said last is in `final_obs` and `final_info`.
     make = functools.partial(StackingEnv, action_pool, num_available, **options)
     envs = AsyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-    # seed + i would let neighbouring seeds share environments; a SeedSequence's words do not.
+    # Unrelated seeds: with gymnasium's seed + i, runs with seeds 0 and 1 would share environments.
+    # This reset only seeds: call reset() without a seed for the first observation.
     envs.reset(seed=np.random.SeedSequence(seed).generate_state(num_envs).tolist())
     return envs
 
@@ -778,7 +786,10 @@ def _views(shape_id: int, num_views: int, seed: int) -> np.ndarray:
     """Pictures of one shape from random viewpoints, (num_views, 84, 84) uint8."""
     bullet = Bullet()
     add_shape(bullet, shape_id, (0, 0, 0), COLOURS[shape_id])
-    # A generator per shape and two numbers of it per view: nothing else decides what view k shows.
+    # Each shape has its own generator, and each view takes two numbers from it: view k depends only
+    # on the seed, the shape and k. The camera goes all the way round [code], the light with it. To
+    # turn the shape is then to start elsewhere on the circle: the pictures tell its form and size,
+    # not its angle, which the policy sees only once the shape stands in the scene.
     rng = np.random.default_rng([seed, shape_id])
     pictures = []
     for _ in range(num_views):
@@ -799,12 +810,10 @@ def action_observations(
     """Pictures of each shape, alone on black, from independent random viewpoints (A.4).
 
     `action_ids` (n,) are distinct, "image" is the only modality, `workers` counts processes. One
-    seed gives the same bytes, whatever `workers` and the other ids asked for, and view k does not
-    depend on `num_observations`. Returns (n, num_observations, 84, 84) uint8, in the order of the
-    ids. ValueError for bad ids, another modality, no observations or workers.
+    seed gives the same bytes, whatever `workers` and the other ids asked for. Returns
+    (n, num_observations, 84, 84) uint8, in the order of the ids. ValueError for bad arguments.
     """
-    # [code] has colour pictures, and of the 1,024 only 32 differ; [here] all differ, and they are
-    # grey, because the states are.
+    # [code] has colour pictures, only 32 of them different; [here] all differ, in grey like states.
     check_ids(action_ids)
     if modality not in MODALITIES:
         raise ValueError(f"unknown modality {modality!r}; allowed: {', '.join(MODALITIES)}")
@@ -843,10 +852,7 @@ def shape_sheet() -> Image.Image:
 
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
-    """Write pictures (h, w, 3) uint8 as a GIF that rests on its last picture.
-
-    The GIF is made in memory first. If writing it fails, no half file stays, nor an older one.
-    """
+    """Write pictures (h, w, 3) uint8 as a GIF that rests on its last one; all of it or no file."""
     data = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
     durations = [round(1000 / fps)] * len(pictures)  # ms

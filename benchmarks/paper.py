@@ -46,29 +46,29 @@ from hvae import UserError  # noqa: E402
 # measured and published scores join. They hold their method's own flags and nothing else: --recipe
 # paper is Tables 3 and 4 but for these.
 
-FIGURE_8 = {  # the baselines and ablations of the main paper
+CREATE = "create"  # how every training in CREATE begins; options for all of its rows stand here
+TASKS = ("push", "seesaw", "obstacle")  # CREATE's in the main paper
+NINE = "navigate cannon ladder belt buckets basket collide moving funnel".split()  # C.1
+
+ABLATIONS = {
     "ours": "",
-    "non_hierarchical_vae": "--representation vae",
     "ours_no_entropy": "--ent-coef 0",
     "ours_no_subsampling": "--no-subsample",
     "nearest_neighbor": "--method nearest-neighbor",
     "continuous_output": "--method continuous",
 }
+FIGURE_8 = ABLATIONS | {"non_hierarchical_vae": "--representation vae"}
 METHODS = FIGURE_8 | {"oracle_encoder_all_actions": "--representation hvae-all"}
+# A.2 gives the representations, so there is no encoder to compare. "ours" is D.3.2's utility with
+# Table 4's units; the fast recipe's is bilinear [here].
+RECSYS = {name: f"--no-bilinear --hidden-size 64 {flags}" for name, flags in ABLATIONS.items()}
+RECSYS["ours_bilinear"] = "--bilinear"
 ENGINEERED = {"engineered": "--representation engineered"}
 VIDEO = {"ours_video": "--modality video"}
 ONE_HOT = {"ours_alternate_modality": "--modality onehot"}
 MORE_ENTROPY = {"ours_more_entropy": "--ent-coef 0.02"}  # [here]; Table 3 has 0.005
 FULL_SPLIT = {"ours_full_split": "--split full"}  # Tables 1 and 2
 LINEAR = {"ours_linear_path": "--linear-path"}  # [here] of encoders
-RECSYS = {  # A.2 gives the representations, so there is no encoder to compare
-    "ours": "--no-bilinear --hidden-size 64",  # D.3.2's utility, Table 4's units
-    "ours_bilinear": "--bilinear",  # [here], and the fast recipe's default
-    "ours_no_entropy": "--no-bilinear --hidden-size 64 --ent-coef 0",
-    "ours_no_subsampling": "--no-bilinear --hidden-size 64 --no-subsample",
-    "nearest_neighbor": "--method nearest-neighbor --hidden-size 64",
-    "continuous_output": "--method continuous --hidden-size 64",
-}
 SUBGOAL = {"ours": "", "ours_no_subgoal_reward": "--no-subgoal-reward"}  # C.3
 # C.4. Both in full: the recipes differ in which of them is the default.
 AUXILIARY = {"ours": "--no-aux-conditioned", "ours_conditioned_auxiliary": "--aux-conditioned"}
@@ -76,10 +76,7 @@ PLACEMENT = {"ours_no_place": "--placement none", "ours": "", "ours_2d_place": "
 # A.3: "HVAE was trained as an oracle encoder over the entire action set"; one policy for all.
 ANALYSIS = {"ours": "--split analysis --representation hvae-all"}
 TEST = "evaluate {analysis/TASK/ours} --num-available 50"  # K of Table 3
-RATIOS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 ENCODERS = {"ours": "", "non_hierarchical_vae": "--no-hierarchical"}
-CREATE = ("push", "seesaw", "obstacle")  # in the main paper
-NINE = "navigate cannon ladder belt buckets basket collide moving funnel".split()  # C.1
 
 
 def rows(command: str, methods: dict[str, str], tasks=("",)) -> dict[str, str]:
@@ -101,72 +98,67 @@ TABLE = {
         "gridworld/ours": "gridworld --quick",
         "gridworld/engineered": "gridworld --quick --representation engineered",
         "recsys/ours_bilinear": "recsys --quick --bilinear",
-        "create/ours": "create --quick",
+        "create/ours": f"{CREATE} --quick",
         "stacking/ours": "stacking --quick",
     },
     "gridworld": rows("gridworld", METHODS | ENGINEERED | ONE_HOT)
     | {"ours_linear_path": "gridworld --representation {fig4/ours_linear_path}"},
     "recsys": rows("recsys", RECSYS),
-    "create-push": rows("create --task push", METHODS | VIDEO | MORE_ENTROPY),
-    "create-seesaw": rows("create --task seesaw", METHODS | VIDEO | ENGINEERED | MORE_ENTROPY),
-    "create-obstacle": rows("create --task obstacle", METHODS | VIDEO | MORE_ENTROPY),
+    "create-push": rows(f"{CREATE} --task push", METHODS | VIDEO | MORE_ENTROPY),
+    "create-seesaw": rows(f"{CREATE} --task seesaw", METHODS | VIDEO | ENGINEERED | MORE_ENTROPY),
+    "create-obstacle": rows(f"{CREATE} --task obstacle", METHODS | VIDEO | MORE_ENTROPY),
     "stacking": rows("stacking", METHODS | ENGINEERED)
     | {"ours_linear_path": "stacking --representation {fig6/ours_linear_path}"},
     "fig4": rows("hvae gridworld", ENCODERS | ONE_HOT | LINEAR),
     "fig5": rows("hvae create", ENCODERS | VIDEO | FULL_SPLIT),
     "fig6": rows("hvae stacking", ENCODERS | FULL_SPLIT | LINEAR),
-    "fig8": rows("create --task TASK", FIGURE_8, NINE),
+    "fig8": rows(f"{CREATE} --task TASK", FIGURE_8, NINE),
     "fig9": {},  # below
-    "fig10": rows("create --task TASK", SUBGOAL, CREATE),
-    "fig11": rows("create --task TASK", AUXILIARY, CREATE),
+    "fig10": rows(f"{CREATE} --task TASK", SUBGOAL, TASKS),
+    "fig11": rows(f"{CREATE} --task TASK", AUXILIARY, TASKS),
     # C.5. Runs are tested with 500 products available (Table 3); [code] with 25.
     "fig12": rows("recsys --fully-observable", RECSYS)
     | rows("evaluate {ours}", vary("num-available", 25)),
     "fig13": rows("stacking", PLACEMENT | FULL_SPLIT),  # C.6
-    "table1": rows("create --task TASK", {"ours": ""} | FULL_SPLIT, CREATE),
-    "analysis": rows("create --task TASK", ANALYSIS, CREATE),
-    "analysis-angle": rows(TEST, vary("min-angle-gap", 15, 12, 9, 6, 3), CREATE),
+    "table1": rows(f"{CREATE} --task TASK", {"ours": ""} | FULL_SPLIT, TASKS),
+    "analysis": rows(f"{CREATE} --task TASK", ANALYSIS, TASKS),
+    "analysis-angle": rows(TEST, vary("min-angle-gap", 15, 12, 9, 6, 3), TASKS),
     # Published: squared distances 0.5 .. 5, which depend on the scale of one encoder's table.
     # [here] the share of unseen tools that are too near to a training tool: 0 .. 0.9.
     "analysis-embedding": rows(
-        TEST, vary("min-embedding-distance", *(f"0.{q}" for q in range(10))), CREATE
+        TEST, vary("min-embedding-distance", *(f"0.{q}" for q in range(10))), TASKS
     ),
     # Published ratios: up to 0.8; and of unseen tools only those above a distance of 3, the sixth
     # of the ten distances above.
     "analysis-unseen-ratio": rows(
-        f"{TEST} --min-embedding-distance 0.5", vary("unseen-ratio", *RATIOS), CREATE
+        f"{TEST} --min-embedding-distance 0.5",
+        vary("unseen-ratio", 0.0, 0.2, 0.4, 0.6, 0.8, 1.0),
+        TASKS,
     ),
     "analysis-set-size": {},  # below
 }
 for method in ("ours", "ours_no_entropy", "ours_no_subsampling"):
     test = f"evaluate {{create-TASK/{method}}} --episodes 1000"  # [code]
-    tests = rows(test, vary("num-available", *range(10, 61, 5)), ("push", "seesaw"))
+    tests = rows(test, vary("num-available", *range(10, 61, 5)), TASKS[:2])
     TABLE["analysis-set-size"] |= {f"{method}/{row}": command for row, command in tests.items()}
 # C.2. Zero-shot is tested as the others learn: with all unseen actions available at once. [code]
 # 500 products in the Recommender's zero-shot test; [here] the 2,000 that its policies adapt to.
 WHOLE = {"create-obstacle": 507, "create-seesaw": 507, "stacking": 203, "gridworld": 256}
 for name, size in (WHOLE | {"recsys": 2000}).items():
-    ours = TABLE[name]["ours"]
-    discrete = TABLE[name]["nearest_neighbor"]
-    TABLE["fig9"] |= {
-        f"{name}/zero-shot": f"evaluate {{{name}/ours}} --num-available {size}",
-        f"{name}/ours_from_scratch": f"{ours} --adapt",
-        f"{name}/ours_finetuned": f"{ours} --finetune {{{name}/ours}}",
-        f"{name}/discrete_from_scratch": f"{discrete} --adapt",
-        f"{name}/discrete_finetuned": f"{discrete} --finetune {{{name}/nearest_neighbor}}",
-    }
+    TABLE["fig9"][f"{name}/zero-shot"] = f"evaluate {{{name}/ours}} --num-available {size}"
+    for theirs, method in (("ours", "ours"), ("discrete", "nearest_neighbor")):
+        train = TABLE[name][method]
+        TABLE["fig9"][f"{name}/{theirs}_from_scratch"] = f"{train} --adapt"
+        TABLE["fig9"][f"{name}/{theirs}_finetuned"] = f"{train} --finetune {{{name}/{method}}}"
 
 
 @dataclass(frozen=True)
 class Args:
-    """Run the commands of these figures that have no result yet."""
-
     figures: tyro.conf.Positional[tuple[str, ...]]  # names in TABLE, or all
     only: tuple[str, ...] = ()  # rows: their names, or what stands between slashes in them
     seeds: tuple[int, ...] = (0, 1, 2)  # published: 5 seeds, 8 in Grid World
     recipe: Literal["fast", "paper"] = "fast"  # of policies; paper: of Figures 4-6's encoders, too
     budget: float = 1.0  # factor on the recipe's number of environment steps
-    extra: str = ""  # flags for each training, as --extra="--ent-coef 0.02"; rows keep their names
     jobs: int = 1  # commands at a time
     dry_run: bool = False  # only print the commands
     runs_dir: str = "runs"  # where the runs live, from the repository's root
@@ -181,15 +173,10 @@ class Job:
     row: str
     seed: int
     kind: str  # train, evaluate or hvae
-    words: list[str]  # of its command line
-    args: ppo.Args | ppo.EvaluateArgs | hvae.Args  # as the script reads them
+    command: str
+    args: ppo.Args | ppo.EvaluateArgs | hvae.Args  # as the script reads the command
     folder: Path  # of the run; of an encoder: its table
-    needs: "list[Job]"  # what it starts from
-
-    @property
-    def command(self) -> str:
-        script = "hvae.py" if self.kind == "hvae" else "ppo_actiongen.py"
-        return f"python {script} {shlex.join(self.words)}"
+    needs: "list[Job]"  # all that has to be there before; of a test, the run comes last
 
 
 @cache  # what several rows need is one job
@@ -201,12 +188,14 @@ def expand(figure: str, row: str, seed: int, args: Args) -> Job:
         if word.startswith("{"):
             name = word.strip("{}")
             where = (figure, name) if name in TABLE[figure] else name.split("/", 1)
-            needs.append(expand(*where, seed, args))
-            words[i] = needs[-1].folder.as_posix()
+            parent = expand(*where, seed, args)
+            needs += [*parent.needs, parent]
+            words[i] = parent.folder.as_posix()
     if kind == "evaluate":
-        test = tyro.cli(ppo.EvaluateArgs, args=[*words, "--save"])
-        words = ["evaluate", *words, "--save"]
-        return Job(figure, row, seed, kind, words, test, needs[0].folder, needs)
+        words.append("--save")
+        command = f"python ppo_actiongen.py evaluate {shlex.join(words)}"
+        test = tyro.cli(ppo.EvaluateArgs, args=words)
+        return Job(figure, row, seed, kind, command, test, parent.folder, needs)
 
     if kind != "hvae":  # one encoder seed for all policies, as published
         words = [kind, *words, "--seed", str(seed)]
@@ -219,43 +208,35 @@ def expand(figure: str, row: str, seed: int, args: Args) -> Job:
     if args.runs_dir != "runs":
         words += ["--runs-dir", args.runs_dir]
     if kind == "hvae":
+        command = f"python hvae.py {shlex.join(words)}"
         encoder = hvae.parse_args(words)
         table = hvae.representation_path(encoder)
-        return Job(figure, row, seed, kind, words, encoder, table, needs)
+        return Job(figure, row, encoder.split_seed, kind, command, encoder, table, needs)
 
-    if args.budget != 1:
-        usual = ppo.parse_args(words).total_timesteps
-        words += ["--total-timesteps", str(round(args.budget * usual))]
-    words += shlex.split(args.extra)
     training = ppo.parse_args(words)
-    folder = Path(training.runs_dir) / (training.run_name or ppo.run_name_of(training))
-    return Job(figure, row, seed, "train", words, training, folder, needs)
+    if args.budget != 1:
+        training.total_timesteps = round(args.budget * training.total_timesteps)
+        words += ["--total-timesteps", str(training.total_timesteps)]
+    command = f"python ppo_actiongen.py {shlex.join(words)}"
+    folder = Path(args.runs_dir) / ppo.run_name_of(training)
+    return Job(figure, row, seed, "train", command, training, folder, needs)
 
 
 def plan(args: Args) -> list[Job]:
     """The jobs of these figures, each after what it needs; UserError for what cannot be meant."""
     for figure in args.figures or [""]:
         hvae.choose("figure", figure, [*TABLE, "all"])
-    figures = tuple(TABLE) if "all" in args.figures else args.figures
-    known = {word for figure in figures for row in TABLE[figure] for word in (row, *row.split("/"))}
+    figures = TABLE if "all" in args.figures else args.figures
+    names = {(f, row): {row, *row.split("/")} for f in figures for row in TABLE[f]}
     for name in args.only:
-        hvae.choose("row", name, sorted(known))
-    if not args.seeds or args.budget <= 0 or args.jobs < 1:
+        hvae.choose("row", name, sorted(set().union(*names.values())))
+    if not args.seeds or not args.budget > 0 or args.jobs < 1:
         raise UserError("at least one seed, a budget above 0 and one job are needed")
-
-    jobs: dict[tuple, Job] = {}
-
-    def add(job: Job) -> None:
-        for need in job.needs:
-            add(need)
-        jobs.setdefault((job.figure, job.row, job.command), job)  # encoders: once for all seeds
-
-    for seed in args.seeds:  # seed by seed, so that an interrupted matrix is balanced
-        for figure in figures:
-            for row in TABLE[figure]:
-                if not args.only or {row, *row.split("/")} & set(args.only):
-                    add(expand(figure, row, seed, args))
-    return list(jobs.values())
+    chosen = [where for where, words in names.items() if not args.only or words & {*args.only}]
+    # Seed by seed, so that an interrupted matrix is balanced.
+    jobs = [expand(*where, seed, args) for seed in args.seeds for where in chosen]
+    jobs = [one for job in jobs for one in (*job.needs, job)]
+    return list({(job.figure, job.row, job.command): job for job in jobs}.values())  # each once
 
 
 # ---- what a finished command has left behind ----
@@ -264,8 +245,9 @@ KEY = "env task method seed split split_seed recipe steps phase".split()
 COLUMNS = KEY + "score stderr episodes pool_size hours machine command".split()
 CURVE_KEY = "env task method seed recipe steps step".split()
 CURVES = CURVE_KEY + "train_score valid_score episode_score".split()
-# What a test is asked; its answers in evaluations.csv say the same in these columns.
+# What a test is asked, and its answer: columns of evaluations.csv.
 QUESTION = "actions num_available min_angle_gap min_embedding_distance unseen_ratio episodes"
+ANSWER = ("score", "stderr", "episodes", "pool_size")
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -280,43 +262,18 @@ def read(path: Path) -> list[dict[str, str]]:
 def machine() -> str:
     """The processor: hours mean little without it. All scripts use one thread."""
     cpu = Path("/proc/cpuinfo")  # Linux
-    text = cpu.read_text(encoding="utf-8") if cpu.exists() else ""
-    found = re.search(r"model name\s*: (.+)", text)
-    return f"{found[1] if found else platform.processor()}, 1 thread(s)"
-
-
-def results_of(job: Job) -> dict | None:
-    """results.json of a training, None if it is not finished.
-
-    UserError if the folder holds another command's run: its scores are not this row's.
-    """
-    path = job.folder / "results.json"
-    if not path.exists():
-        return None
-    made = json.loads((job.folder / "args.json").read_text("utf-8"))
-    for name, wanted in vars(job.args).items():
-        if name not in ppo.FREE and made.get(name, "missing") != wanted:
-            raise UserError(f"{job.folder} holds a run with another {name}: move it away")
-    return json.loads(path.read_text("utf-8"))
-
-
-def as_text(value) -> str:
-    """A value in a CSV file."""
-    return "" if value is None else str(value)
-
-
-def answers_of(job: Job, trained: dict) -> list[dict]:
-    """The rows of evaluations.csv with this question for the checkpoint that the run has now."""
-    wanted = {name: as_text(getattr(job.args, name)) for name in QUESTION.split()}
-    wanted["best_step"] = as_text(trained["best_step"])
-    return [row for row in read(job.folder / "evaluations.csv") if wanted.items() <= row.items()]
+    names = re.findall("model name.*: (.+)", cpu.read_text("utf-8")) if cpu.exists() else []
+    return f"{names[0] if names else platform.processor()}, 1 thread(s)"
 
 
 def score_rows(job: Job) -> list[dict]:
-    """The rows of results/<figure>.csv for one job, [] if it is not finished."""
-    run = job.needs[0] if job.kind == "evaluate" else job
+    """The rows of results/<figure>.csv for one job, [] if it is not finished.
+
+    UserError if the folder holds another command's run: its scores are not this row's.
+    """
+    run = job.needs[-1] if job.kind == "evaluate" else job
     row = {name: getattr(run.args, name) for name in ("env", "split", "split_seed", "recipe")}
-    row.update(task=getattr(run.args, "task", ""), method=run.row.split("/")[-1])
+    row.update(task=getattr(run.args, "task", None) or "", method=run.row.split("/")[-1])
     row.update(seed=job.seed, machine=machine(), command=job.command)
     if getattr(run.args, "fully_observable", False):
         row["env"] = "recsys_full"
@@ -325,20 +282,26 @@ def score_rows(job: Job) -> list[dict]:
 
     if job.kind == "hvae":
         path = job.folder.with_suffix(".json")
-        if not path.exists():
-            return []
-        scores = json.loads(path.read_text("utf-8"))
+        scores = json.loads(path.read_text("utf-8")) if path.exists() else {}
         return [row | {"phase": name, "score": score} for name, score in scores.items()]
 
-    trained = results_of(run)
-    if trained is None:
+    path = run.folder / "results.json"  # what a training writes at its end
+    if not path.exists():
         return []
+    trained = json.loads(path.read_text("utf-8"))
+    made = json.loads(path.with_name("args.json").read_text("utf-8"))
+    for name, wanted in vars(run.args).items():
+        if name not in ppo.FREE and made.get(name, "missing") != wanted:
+            raise UserError(f"{run.folder} holds a run with another {name}: move it away")
     row["steps"] = trained["steps"]
-    if job.kind == "evaluate":
+    if job.kind == "evaluate":  # of the checkpoint that the run has now; the last answer counts
+        asked = {name: getattr(job.args, name) for name in QUESTION.split()}
+        asked["best_step"] = trained["best_step"]
+        wanted = {name: "" if x is None else str(x) for name, x in asked.items()}
+        answers = read(job.folder / "evaluations.csv")
+        answers = [answer for answer in answers if wanted.items() <= answer.items()]
         row["phase"] = job.row.split("/")[-1]
-        for found in answers_of(job, trained):  # the last one counts
-            row.update({x: float(found[x]) for x in ("score", "stderr", "episodes", "pool_size")})
-        return [row] if "score" in row else []
+        return [row | {name: float(answer[name]) for name in ANSWER} for answer in answers[-1:]]
     row["hours"] = trained["hours"]
     # A policy that adapts has one set of actions, and one phase.
     phases = [phase for phase in ("train", "valid", "test") if phase in trained]
@@ -358,22 +321,16 @@ def curve_rows(job: Job) -> list[dict]:
 
 def merge(path: Path, columns: list[str], key: list[str], rows: list[dict]) -> None:
     """Put rows into a CSV file, in the place of those of the same key; never half a file."""
-    old = read(path)
-    if old and list(old[0]) != columns:
-        raise UserError(f"{path} has other columns: move it away")
     table = {}
-    for row in [*old, *rows]:
-        short = {k: f"{x:.6g}" if isinstance(x, float) else x for k, x in row.items()}
-        line = {column: as_text(short.get(column)) for column in columns}
-        table[tuple(line[column] for column in key)] = line
-
-    def by_size(item):  # 9 before 10
-        return [part.zfill(9) if part.isdigit() else part for part in item[0]]
-
+    for row in [*read(path), *rows]:
+        short = {k: f"{x:.6g}" if isinstance(x, float) else str(x) for k, x in row.items()}
+        line = {column: short.get(column, "") for column in columns}
+        place = [line[column] for column in key]
+        table[tuple(x.zfill(9) if x.isdigit() else x for x in place)] = line  # 9 before 10
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(line for _, line in sorted(table.items(), key=by_size))
+    writer.writerows(table[place] for place in sorted(table))
     hvae.write(path, lambda file: file.write(text.getvalue().encode("utf-8")))
 
 
@@ -415,14 +372,12 @@ def run_all(jobs: list[Job], args: Args) -> int:
     waiting = list(jobs)
     running: dict[subprocess.Popen, Job] = {}
     succeeded: dict[str, bool] = {}  # by command: jobs of several figures may share one
-    failures = 0
     try:
         while waiting or running:
             for process, job in list(running.items()):
                 if process.poll() is not None:
                     del running[process]
                     succeeded[job.command] = record(job, args)
-                    failures += not succeeded[job.command]
             for job in list(waiting):
                 needed = [succeeded.get(need.command) for need in job.needs]
                 busy = [other.folder for other in running.values()]
@@ -434,7 +389,6 @@ def run_all(jobs: list[Job], args: Args) -> int:
                 if False in needed or succeeded.get(job.command) is False:
                     print(f"  SKIPPED {job.command}", flush=True)
                     succeeded[job.command] = False
-                    failures += 1
                 elif score_rows(job):
                     succeeded[job.command] = record(job, args)
                 else:
@@ -444,11 +398,9 @@ def run_all(jobs: list[Job], args: Args) -> int:
         for process in running:
             if process.poll() is None:  # as Ctrl-C would, so that it tidies up
                 process.terminate() if os.name == "nt" else os.killpg(process.pid, signal.SIGINT)
-            try:
-                process.wait(timeout=10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-    return failures
+        for process in running:
+            process.wait()
+    return sum(not succeeded[job.command] for job in jobs)
 
 
 def main(args: Args) -> None:
@@ -466,9 +418,10 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
+    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell switched Ctrl-C off
+        signal.signal(number, signal.default_int_handler)
     try:
-        main(tyro.cli(Args))
+        main(tyro.cli(Args, description=__doc__))
     except UserError as e:
         raise SystemExit(f"error: {e}") from None
     except KeyboardInterrupt:

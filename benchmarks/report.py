@@ -70,7 +70,7 @@ ANALYSES = {  # figure -> its name in published_analyses.csv, what is varied
     "analysis-set-size": ("action_set_size", "available tools"),
 }
 MAIN = ("gridworld", "recsys", "create-push", "stacking")  # the figures of the summary
-FIGURE_14 = ("gridworld", "recsys", "fig12", *(f"create-{t}" for t in paper.CREATE), "stacking")
+FIGURE_14 = ("gridworld", "recsys", "fig12", *(f"create-{t}" for t in paper.TASKS), "stacking")
 SUMMARY = ["ours", "ours_conditioned_auxiliary", "ours_linear_path", "ours_bilinear", "engineered"]
 SUMMARY += ["nearest_neighbor", "continuous_output"]
 HEADS = {"train": "seen (published)", "test": "**unseen** (published)"}
@@ -111,11 +111,12 @@ def published(figure: str, place: Place, method: str, phase: str) -> tuple:
 
 
 def notes(figure: str, rows: list[dict]) -> list[str]:
-    """What has to be said of a comparison with published scores, below a table."""
-    some = {row["method"] for row in rows if row["env"] == "create" and row["recipe"] == "fast"}
+    """What has to be said of a comparison with published scores of policies, below a table."""
+    fast = [row for row in rows if row["env"] == "create" and row["recipe"] == "fast"]
+    some = {row["method"] for row in fast if row["steps"]}
     text = []
     if some - {"ours_conditioned_auxiliary"} and figure not in ("fig11", *ANALYSES):
-        link = "[the position of C.4]({folder}README.md#create)"
+        link = "[the position of C.4](README.md#create)"
         text.append(f"CREATE: every row has {link}, most published scores do not.")
     if "nearest_neighbor" in some:
         text.append(
@@ -134,36 +135,33 @@ def tested(phase: str) -> float:
 def group(rows: list[dict], phase="phase", column="score", every=False) -> Cells:
     """A column's numbers by place, method, phase (or another column), in the order of METHODS."""
     # Unless `every`, one number of steps per environment: that of most methods, or the largest.
-    runs = {(row["env"], int(row["steps"] or 0), row["method"]) for row in rows}
+    rows = [row | {"steps": int(row["steps"] or 0)} for row in rows]
     usual: dict[str, tuple] = {}
+    runs = {(row["env"], row["steps"], row["method"]) for row in rows}
     for (env, steps), n in Counter(run[:2] for run in runs).items():
         usual[env] = max(usual.get(env, (0, 0)), (n, steps))
-    cells: Cells = defaultdict(lambda: defaultdict(list))
-    for row in sorted(rows, key=lambda row: tested(row[phase])):
-        place = (row["env"], row["task"], int(row["steps"] or 0))
-        if row[column] and (every or place[2] == usual[row["env"]][1]):
-            cells[place, row["method"]][row[phase]].append(float(row[column]))
     tasks = list(dict.fromkeys((row["env"], row["task"]) for row in rows))
-    methods = list(METHODS)
-    order = {key: (tasks.index(key[0][:2]), methods.index(key[1]), key[0][2]) for key in cells}
-    return {key: cells[key] for key in sorted(cells, key=order.get)}
+
+    def order(row):
+        task = tasks.index((row["env"], row["task"]))
+        return task, [*METHODS].index(row["method"]), row["steps"], tested(row[phase])
+
+    cells: Cells = defaultdict(lambda: defaultdict(list))
+    for row in sorted(rows, key=order):
+        if row[column] and (every or row["steps"] == usual[row["env"]][1]):
+            place = (row["env"], row["task"], row["steps"])
+            cells[place, row["method"]][row[phase]].append(float(row[column]))
+    return cells
 
 
-def title(place: Place) -> str:
-    """How an environment and task are called."""
-    return f"{ENVIRONMENTS[place[0]][0]} {place[1]}".strip()
-
-
-def label(place: Place, method: str) -> str:
-    """How a method is called; the Recommender's has no encoder, its representations are given."""
-    name = METHODS[method][0]
-    return name.replace("HVAE + u", "U") if place[0].startswith("recsys") else name
-
-
-def steps(place: Place) -> str:
-    """The number of steps: 10M, 0.04M; "" of an encoder."""
-    millions = round(place[2] / 1e6, 2 if place[2] < 1e7 else 0)
-    return f"{millions:g}M" if place[2] else ""
+def names(place: Place, method: str) -> tuple[str, str, str]:
+    """Environment and task; method; number of steps: 10M, 0.04M, "" of an encoder."""
+    env, task, steps = place
+    label = METHODS[method][0]
+    if env.startswith("recsys"):  # no encoder: its representations are given
+        label = label.replace("HVAE + u", "U")
+    millions = round(steps / 1e6, 2 if steps < 1e7 else 0)
+    return f"{ENVIRONMENTS[env][0]} {task}".strip(), label, f"{millions:g}M" if steps else ""
 
 
 # ---- tables ----
@@ -176,8 +174,7 @@ def table(figure: str, cells: Cells) -> str:
     named = figure == "main" or len({place[:2] for place, _ in cells}) > 1
     lines = []
     for (place, method), cell in cells.items():
-        line = [title(place) if named else "", label(place, method), steps(place)]
-        line.append(str(max(map(len, cell.values()))))
+        line = [*names(place, method), str(max(map(len, cell.values())))]
         for phase in phases:
             seeds = cell.get(phase, [])
             theirs, _ = published(figure, place, method, phase)
@@ -188,7 +185,8 @@ def table(figure: str, cells: Cells) -> str:
                 text += f" ({theirs:.3f})"
             line.append(text)
         known = "test" in cell and place[0] in CEILINGS
-        lines.append([*line, f"{CEILINGS[place[0]]:.3f}" if known else ""])
+        line.append(f"{CEILINGS[place[0]]:.3f}" if known else "")
+        lines.append(line if named else ["", *line[1:]])
     heads = [HEADS.get(p, p.split("=")[-1] if figure in ANALYSES else p) for p in phases]
     corner = ANALYSES.get(figure, (figure, " "))[1]
     head = [corner, "method", "steps", "seeds", *heads, "ceiling"]
@@ -225,29 +223,29 @@ def draw_bars(path: Path, cells: Cells) -> None:
     from matplotlib.patches import Patch
 
     methods = sorted({method for _, method in cells}, key=[*METHODS].index)
-    some = list(dict.fromkeys(place for place, _ in cells))
-    width = 3.3 if len(some) > 1 else 6.5
-    figure, axes = canvas(len(some), 3, width, 0.32 * len(methods) + 0.7, sharey=True)
+    places = list(dict.fromkeys(place for place, _ in cells))
+    width = 3.3 if len(places) > 1 else 6.5
+    figure, axes = canvas(len(places), 3, width, 0.32 * len(methods) + 0.7, sharey=True)
     outline = dict(fill=False, edgecolor="0.2", lw=0.9)
     key = {"unseen": Patch(color="0.35"), "seen": Patch(color="0.35", alpha=0.4)}
     key |= {"published": Patch(**outline), "seed": Line2D([], [], color="0", marker=".", ls="")}
-    panels = dict(zip(some, axes, strict=True))
-    for place, axis in panels.items():
+    for place, axis in zip(places, axes, strict=True):
         if place[0] in CEILINGS:
             line = dict(color="0.5", lw=0.8, ls="--")
             key["ceiling, unseen"] = axis.axvline(CEILINGS[place[0]], **line)
-        axis.set(title=f"{title(place)}, {steps(place)} steps", xlabel=ENVIRONMENTS[place[0]][1])
     for (place, method), cell in cells.items():
+        axis = axes[places.index(place)]
+        title, _, steps = names(place, method)
+        axis.set(title=f"{title}, {steps} steps", xlabel=ENVIRONMENTS[place[0]][1])
         y = methods.index(method)
         for at, phase, alpha in ((y - 0.2, "test", 1.0), (y + 0.2, "train", 0.4)):
             seeds = cell.get(phase)
             if seeds:
-                color = METHODS[method][1]
-                panels[place].barh(at, mean(seeds), 0.36, color=color, alpha=alpha)
-                panels[place].plot(seeds, [at] * len(seeds), ".", color="black", ms=3, zorder=3)
+                axis.barh(at, mean(seeds), 0.36, color=METHODS[method][1], alpha=alpha)
+                axis.plot(seeds, [at] * len(seeds), ".", color="black", ms=3, zorder=3)
                 theirs, _ = published("", place, method, phase)
-                panels[place].barh(at, theirs or 0, 0.36, **outline)
-    axes[0].set_yticks(range(len(methods)), [label(some[0], method) for method in methods])
+                axis.barh(at, theirs or 0, 0.36, **outline)
+    axes[0].set_yticks(range(len(methods)), [names(places[0], method)[1] for method in methods])
     axes[0].invert_yaxis()
     save(figure, path, key, 5)
 
@@ -277,19 +275,29 @@ def lines_of(figure: str, cells: Cells, zero: dict[Place, float]) -> dict[str, l
     panels = defaultdict(list)
     mark = "o" if figure in ANALYSES else ""
     for (place, method), phases in cells.items():
-        panel = panels[f"{title(place)}, {ENVIRONMENTS[place[0]][1]}"]
+        title, label, _ = names(place, method)
+        panel = panels[f"{title}, {ENVIRONMENTS[place[0]][1]}"]
         color = METHODS[method][1]
-        panel.append((label(place, method), phases, dict(color=color, marker=mark)))
+        panel.append((label, phases, dict(color=color, marker=mark)))
         both = {phase: published(figure, place, method, phase) for phase in phases}
         theirs = {phase: [m - std, m + std] for phase, (m, std) in both.items() if m is not None}
         if theirs:
             look = dict(color=color, ls=":", marker="s", mfc="white", alpha=0.5)
-            text = f"{label(place, method).removesuffix(', conditioned')}, published"
-            panel.append((text, theirs, look))
+            panel.append((f"{label.removesuffix(', conditioned')}, published", theirs, look))
         if place in zero:
             level = {step: [zero[place]] for step in phases}
             panel.append(("zero-shot", level, dict(color="black", ls="--")))
     return panels
+
+
+def draw_engineered() -> None:
+    """Figure 4's picture without an encoder: the five moves of the held-out skills (B)."""
+    module = hvae.load_environment("gridworld")
+    _, *held_out = module.split_actions().values()
+    held_out = np.concatenate(held_out)
+    moves = module.engineered_representations("5d")[held_out]
+    path = RESULTS / "fig4-tsne-engineered.png"
+    hvae.plot_tsne(moves, module.action_labels()[held_out], path, "gridworld-engineered-5d")
 
 
 # ---- the pages ----
@@ -310,7 +318,7 @@ def section(name: str, draw: bool) -> str:
         for (place, method), points in group(rows, "step", "valid_score", True).items():
             lines = [("training actions", seen[place, method], dict(color="0.5", ls="--"))]
             lines.append(("validation actions", points, dict(color=METHODS[method][1])))
-            panels[f"{title(place)}\n{label(place, method)}"] = lines
+            panels["\n".join(names(place, method)[:2])] = lines
         picture = partial(draw_lines, path, panels, "million steps", 9, 1.4)
     elif name == "fig9":
         tests = group([row for row in rows if row["phase"] == "zero-shot"])
@@ -321,10 +329,10 @@ def section(name: str, draw: bool) -> str:
         text = "Success with unseen actions over steps of training on them."
     elif name in ANALYSES:
         text = table(name, group(rows, every=True))
-        lines = lines_of(name, group(rows), {})
-        picture = partial(draw_lines, path, lines, ANALYSES[name][1])
+        picture = partial(draw_lines, path, lines_of(name, group(rows), {}), ANALYSES[name][1])
     elif figure in ("fig4", "fig5", "fig6"):  # t-SNE by hvae.py, one picture per encoder
         text = table(name, group(rows))
+        picture = draw_engineered if name == "fig4" else None
     else:
         rows = [row for row in rows if row["phase"] != "valid"]
         cells = group(rows, every=True)
@@ -334,7 +342,7 @@ def section(name: str, draw: bool) -> str:
     if draw and picture:
         picture()
     pictures = [path, *sorted(RESULTS.glob(f"{name}-tsne-*.png"))]
-    images = [f"![{p.stem}]({{folder}}{p.name})" for p in pictures if p.exists()]
+    images = [f"![{p.stem}]({p.name})" for p in pictures if p.exists()]
     remarks = notes(figure, rows) if text else []
     return "\n\n".join(filter(None, [text, *remarks, *images])) + "\n"
 
@@ -350,12 +358,10 @@ def main(check: bool = False) -> None:
     with matplotlib.rc_context(LOOK):  # for these pictures only
         contents = {name: section(name, not check) for name in names}
     for page, folder in ((RESULTS / "README.md", ""), (RESULTS.parent / "README.md", "results/")):
-        text = page.read_text(encoding="utf-8") if page.exists() else ""
-        new = text
+        text = new = page.read_text(encoding="utf-8") if page.exists() else ""
         for name, content in contents.items():
-            content = content.replace("{folder}", folder)
-            marks = re.compile(rf"(<!-- begin:{name} -->\n).*?(<!-- end:{name} -->)", re.S)
-            new = marks.sub(lambda m, content=content: m[1] + content + m[2], new)
+            between = rf"(?<=<!-- begin:{name} -->\n).*?(?=<!-- end:{name} -->)"
+            new = re.sub(between, content.replace("](", f"]({folder}"), new, flags=re.S)
         if check and new != text:
             raise SystemExit(f"error: {page} disagrees with the CSV files: run report.py")
         if new != text:

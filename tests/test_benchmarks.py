@@ -23,7 +23,7 @@ from hvae import UserError  # noqa: E402
 
 # All that a method may differ in from its recipe.
 METHOD = "task method representation modality split subgoal_reward fully_observable placement adapt"
-METHOD += " finetune ent_coef subsample aux_conditioned bilinear seed split_seed"
+METHOD += " finetune ent_coef ent_floor subsample aux_conditioned bilinear seed split_seed"
 
 
 def test_every_figure_has_rows_and_its_commands_can_be_pasted():
@@ -58,7 +58,6 @@ def test_a_recipe_is_itself_but_for_the_methods_own_flags(recipe):
             usual["hidden_size"] = 64  # Table 4: the paper's methods keep it, in every recipe
         differs = {k for k, v in asdict(job.args).items() if v != usual[k]}
         assert differs <= set(METHOD.split()) and job.args.seed == 3, job.command
-        # CREATE and Stacking: one split for all seeds, as published
         assert job.args.split_seed == 3 * (job.args.env in ("gridworld", "recsys"))
         folders.setdefault(job.folder, set()).add(repr(job.args))
         env = job.args.env + "_full" * job.args.fully_observable
@@ -99,6 +98,7 @@ def test_a_table_shows_every_budget_and_like_beside_like(tmp_path, monkeypatch):
     assert "|CREATE push|HVAE + utility, conditioned|0M|1|0.500 (0.861)|\n" in text
     assert "|CREATE push, random split|HVAE + utility, conditioned|0M|1|0.500 (0.861)|\n" in text
     assert "position of C.4" in text and "artefact" in text
+    assert report.notes("fig5", [same | dict(method="ours", steps="")]) == []  # encoders have none
     method, place = same["method"], ("create", "push", 9)
     assert report.published("analysis-embedding", place, method, "d=0.9")[0] == 0.2795
 
@@ -139,13 +139,13 @@ def test_a_tiny_experiment_runs_once_until_its_checkpoint_changes(tmp_path, monk
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_who_stops_it_stops_its_commands(tmp_path):
     words = f"gridworld --only engineered --seeds 0 --runs-dir {tmp_path} --results-dir {tmp_path}"
-    command = [sys.executable, "benchmarks/paper.py", *words.split()]
+    command = ["sh", "-c", f"trap '' INT; exec {sys.executable} benchmarks/paper.py {words}"]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     rows = tmp_path / "gridworld-representation-engineered-s0" / "metrics.csv"
     while not (rows.exists() and rows.stat().st_size):
         time.sleep(0.1)
         assert process.poll() is None
-    process.send_signal(signal.SIGTERM)  # the same as Ctrl-C, which some shells switch off
+    process.send_signal(signal.SIGINT)  # though a shell's & switches Ctrl-C off, as `trap` does
     assert "stopped" in process.communicate(timeout=30)[1] and process.returncode == 1
     before = rows.stat().st_size
     time.sleep(2)
