@@ -95,7 +95,7 @@ LADDER_LEAN = 4.0  # [code] a ladder multiplies the sideways part of its motion 
 VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; no feature of them
 
 METRIC = "success"  # the goal was reached in the episode (0 or 1)
-MODALITIES = ("xy", "state", "video")  # B: (x, y) of the ball is the default
+MODALITIES = ("state", "xy", "video")  # the first is the default; see action_observations
 SPLITS = ("default", "random", "full", "analysis")  # of `split_actions`, the default first
 NO_OP = 0  # id of the no-operation action
 # For hvae.py: it models first states as (x - centre) / half_width and moves between states as
@@ -1246,15 +1246,16 @@ PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: trajectories run side by side in one space, too far apart to meet
 
 
-def action_observations(action_ids, num_observations, modality="xy", seed=0, workers=1):
+def action_observations(action_ids, num_observations, modality="state", seed=0, workers=1):
     """Trajectories of a probe ball launched at each tool, an array (A.3 action observations, B).
 
     | modality | result                                                                           |
     |----------|----------------------------------------------------------------------------------|
-    | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm; the paper's default)               |
     | "state"  | float32 (len(ids), n, 7, 6): tool x, y, ball x, y (norm), ball velocity (norm/s) |
+    | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm)                                    |
     | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same scenes                 |
 
+    appendix: (x, y); [code] learned all of its tables from "state"; [here] as [code].
     n = `num_observations` (paper: 1,024). Frames are 1/3 s apart; the contact is near the middle.
     The bytes for one tool depend on (seed, tool, n) only, not on `workers` or the other ids.
     "video" needs 16 MB per tool at n = 1,024. Raises ValueError for bad ids, modality or n.
