@@ -36,6 +36,7 @@ METHODS = {  # name -> label and colour, the same in every table and picture, in
     "ours_more_entropy": ("HVAE + utility, entropy 0.02 [here]", "#45a0d8"),
     "ours_alternate_modality": ("HVAE + utility, one-hot", "#7fb8e0"),
     "ours_video": ("HVAE + utility, video", "#7fb8e0"),
+    "ours_xy": ("HVAE + utility, (x, y)", "#a8cbe6"),
     "engineered": ("Engineered", "#2e8b6f"),
     "oracle_encoder_all_actions": ("Oracle encoder", "#86bf91"),
     "non_hierarchical_vae": ("VAE", "#e08a3c"),
