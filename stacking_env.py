@@ -193,9 +193,10 @@ CYLINDER = np.vstack([ring(32, 1), ring(32, -1)])
 # those of [code], except for `rectangle`: its footprint is a square, so [code]'s six angles in half
 # a turn show every shape twice; [here] they divide a quarter turn, because A.4 wants the shapes
 # different. Cube and pyramid repeat after 90 degrees, of which [code] uses only the first 45; kept.
-# [code] has the cone twice, as two meshes; kept for the count of 810. To A.4's ten classes Table 2
-# adds "angled" triangles and rectangles: the families of the two that [code] keeps for the test in
-# the Full Split. The moments of a capsule: its tube (3/5 of the mass) and half a ball at each end.
+# [code] has the cone twice, as two meshes; kept for the count of 810. Table 2 has two classes more
+# than A.4, angled-triangle and angled-rectangle, and does not say what they are. In [code] they are
+# the families `middle_triangle`, `hat` and `horizontal_rectangle`, the unseen ones of that table.
+# The moments of a capsule: its tube (3/5 of the mass) and half a ball at each end.
 FAMILIES = (
     Family("middle_triangle", points=prism((-1, -1), (1, -1), (0, 1)),
            scales=(0.1, 0.5, 6), num_angles=10, turn=180, label="angled-triangle"),
@@ -265,7 +266,7 @@ COLOURS = [random_colour(_rng) for _ in SHAPES]
 
 @functools.cache
 def mass_properties(family: Family) -> tuple:
-    """Centre of mass (3,), principal axes, moments of inertia (3,) about them; scale 1, mass 1."""
+    """Centre of mass (3,), body -> shape frame, principal moments (3,); for scale 1, mass 1."""
     if family.moments:
         return np.zeros(3), Rotation.identity(), np.array(family.moments)
     # A solid with flat sides is cut into tetrahedra, whose volumes and centres are known.
@@ -338,22 +339,22 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
     # training shape of its family; all angles of a scale stay together. [code] draws per family;
-    # [here] families of one solid share their draws, because else a cone would be in training and
-    # its copy, the other cone, in the test. So do hat and triangle; `rectangle` and
-    # `horizontal_rectangle` share only their smallest scale. Go through the families, and draw as
-    # many undecided sizes for training as are missing to half of the family.
-    drawn = set()  # solids that are decided, for either side
-    train_solids = set()  # those of them that are for training
+    # [here] families of one solid (a family at a scale) share their draws, because else a cone
+    # would be in training and its copy, the other cone, in the test. So go through the families.
+    # What an earlier family has decided, for training or against it, stays. From the other solids
+    # draw until half of the family is in training: `cone-hires` draws half of its solids, so `cone`
+    # finds all of its own decided; `rectangle` shares one with `horizontal_rectangle`.
+    decided = set()
+    train_solids = set()
     for family in FAMILIES:
         solids = [shape.solid_key() for shape in SHAPES if shape.family is family]
         solids = list(dict.fromkeys(solids))  # each once
-        undrawn = [solid for solid in solids if solid not in drawn]
-        # Earlier families have put some of its solids in training: half, if they share all scales,
-        # else at most one. So `missing` is never negative.
+        undecided = [solid for solid in solids if solid not in decided]
+        # Already in training are half of them, one, or none: `missing` is never negative.
         missing = len(solids) // 2 - len(train_solids.intersection(solids))
-        order = rng.permutation(len(undrawn))
-        train_solids.update(undrawn[k] for k in order[:missing])
-        drawn.update(solids)
+        order = rng.permutation(len(undecided))
+        train_solids.update(undecided[k] for k in order[:missing])
+        decided.update(solids)
     train = np.array([shape.solid_key() in train_solids for shape in SHAPES])
 
     # Full Split (Table 2): the class alone decides. The draw above is thrown away here, but still
@@ -709,7 +710,7 @@ class StackingEnv(gym.Env):
         return all(contact[8] > -REST_DEPTH for contact in self._bullet.getContactPoints())
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres of mass (n, 3), rotations (n, 3, 3) of the bodies in the scene (`shape_ids`)."""
+        """Centres of mass (n, 3), rotations body -> world (n, 3, 3) of all bodies, `shape_ids`."""
         poses = map(self._bullet.getBasePositionAndOrientation, self._bodies)
         centres, quaternions = zip(*poses, strict=True)
         rotations = list(map(p.getMatrixFromQuaternion, quaternions))  # (n, 9)
@@ -719,8 +720,9 @@ class StackingEnv(gym.Env):
         """Height of the highest point of the scene; of what is round, within .01 m."""
         highest = 0.0
         for shape_id, centre, rotation in zip(self.shape_ids, *self.poses(), strict=True):
-            # Turn the world's "up" into the shape's own frame, where `points` are given: world ->
-            # body (the last row of `rotation`) -> shape (`axes`). How far do they reach that way?
+            # Turn the world's "up" into the shape's own frame, where `points` are given. World ->
+            # body is the transpose of `rotation`, and its product with (0, 0, 1) the last row of
+            # `rotation`. Body -> shape is `axes`. How far do the points reach that way?
             family, scale, _ = SHAPES[shape_id]
             com, axes, _ = mass_properties(family)
             up = axes.apply(rotation[2])  # (3,)

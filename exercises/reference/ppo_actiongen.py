@@ -214,6 +214,8 @@ FAST = {
         num_minibatches=16,
         update_epochs=1,  # ... but each picture is used once: four passes move the policy too far
         learning_rate=5e-4,  # smaller minibatches are noisier
+        ent_coef=0.01,  # with 0.005, as in Table 3, some seeds learn next to nothing
+        ent_floor=0.1,  # as in Grid World
         clip_coef=0.2,  # goals are rare, so each of them may teach more
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
         clip_vloss=False,  # steps of clip_coef are too small for values near 10
@@ -333,7 +335,7 @@ def cnn(frames, H, small):
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # features grow with the number of lines in the picture; only their places matter
+    if small:  # features grow with the number of tools in the picture; only their places matter
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -443,8 +445,8 @@ class Agent(nn.Module):
         dims = self.action_parts["position"].shape[0]
         if not self.args.aux_conditioned:  # D.3.2: linear, from the code of the state
             return layer_init(nn.Linear(H, dims), 1.0)
-        # C.4: two layers, from the code and the projected action (B, 2H). With [code]'s gain of 1
-        # each action has a favourite place of its own before training. [here] all start alike.
+        # C.4: two layers, from the code and the projected action (B, 2H). With a last layer of gain
+        # 1 [code] each state has a favourite place before training. [here] all start alike.
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -555,7 +557,7 @@ class Agent(nn.Module):
         if self.args.method == "continuous":
             # D numbers were drawn. [code] adds up their entropies in Grid World and averages them
             # elsewhere; [here] the mean, so that ent_coef means the same for every D.
-            logprob = logprob.sum(1).clamp(-1e5, 1e5)  # [code]: infinite ones differ by NaN
+            logprob = logprob.sum(1).clamp(-1e5, 1e5)  # [code]: -inf minus -inf is NaN
             entropy = entropy.mean(1)
 
         # Where to place it: a Beta distribution for each dimension (D.3.2). With parameters above 1
@@ -683,7 +685,7 @@ def running_returns(rewards, dones, G, gamma):
 
 def ppo_loss(agent, mb, ent_coef):
     """PPO's clipped loss of one minibatch, and the numbers of it that go into metrics.csv."""
-    # How much likelier is each action now than when it was played?
+    # How much likelier is each action now than when it was played? (mb also holds its parts.)
     args = agent.args
     _, logprob, entropy, value = agent.act(mb["state"], mb["available"], action=mb)
     logratio = logprob - mb["logprob"]
@@ -910,13 +912,18 @@ def task_options(args):
 
 
 def with_no_op(action_pool, args):
-    """The pool and CREATE's no-op (A.3): in every episode one of the K [code], in no pool."""
+    """The ids that can be available: those of the pool and, in CREATE, the no-op's (A.3).
+
+    No pool contains the no-op. CREATE adds it to every episode, as one of the K [code].
+    """
     no_op = getattr(hvae.load_environment(args.env), "NO_OP", None)
     return action_pool if no_op is None else np.union1d(action_pool, [no_op])
 
 
 def make_envs(args, phase, num_envs, stream):
     """Environments for a phase, (action_pool, K available), and their first observation."""
+    # make_vec gives every environment a generator of its own, seeded by `stream`, so reset needs no
+    # seed. (Training seeds them again after every checkpoint.) Each reset draws K ids of the pool.
     action_pool, K = phase
     make_vec = hvae.load_environment(args.env).make_vec
     envs = make_vec(num_envs, action_pool, K, list(stream), **task_options(args))
@@ -1067,7 +1074,7 @@ def run_name_of(args):
             if value != usual[option] and option not in ("seed", *FREE):
                 words.append(option if value is True else f"{option}-{value}")
         name = "-".join(words)[:120] + f"-s{args.seed}"
-    # Only what every file system takes, and no more of it than it takes.
+    # Only characters that every file system takes, and not too many.
     return re.sub(r"^\.|[^A-Za-z0-9._-]", "_", name)[:140]
 
 
@@ -1080,7 +1087,7 @@ def claim_folder(args):
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
     # Two processes in one folder would mix their rows. The operating system ends a lock with its
-    # process, however that ends; Python would end it with the variable, so atexit keeps it.
+    # process, however that ends. Python would end it with the variable, so atexit holds on to it.
     lock = FileLock(folder / ".lock", is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -1297,7 +1304,7 @@ def evaluate_run(options):
 
     # The policy as it was trained, but with other actions: that is all of Algorithm 2.
     stream = (args.seed, COMMAND)
-    envs, _ = make_envs(args, phase, 1, stream)
+    envs, _ = make_envs(args, phase, 1, stream)  # for its spaces, which shape the networks
     agent = Agent(envs, best["agent"]["table"].numpy(), train_ids, args)
     envs.close()
     put(best, folder, agent=agent)
