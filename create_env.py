@@ -5,6 +5,10 @@ available tools and a place for it, so that the red target ball reaches the gree
 twelve tasks and 2,111 tools (one, the no-op, does nothing), and 6,248 more for the Full Split and
 the analyses. What a tool does is told by a probe ball that is launched at it (action observations).
 
+In five of the tasks the target rests, and a second, blue ball, the *marker*, is there to knock it.
+There the goal counts only from the *target hit* on: the target has moved more than 3.56 units from
+its start, whatever moved it.
+
     python create_env.py --task push                # a GIF of the best of 400 random episodes
     python create_env.py --play --tools Fan Funnel  # place tools of these classes by mouse
     python create_env.py --sheet tasks              # Figure 7; others: tools, probe
@@ -16,12 +20,12 @@ Paper map
     C.1, Figure 7            TASKS                  C.3              subgoal_reward=False
 
 [code] marks the authors' released implementation, used where the appendix is silent; [here] marks a
-choice of this repository, with its reason. The authors also released CREATE alone, as a package;
-where that differs from [code], it is named.
+choice of this repository, with its reason. Where the two sources differ, a comment has "appendix:",
+"[code]" and, after "[here]", which of them is followed.
 
 Units: the world is a square of 84 x 84 units, one unit per pixel of the observation, x to the
 right, y up, origin in the lower left corner. "norm" means agent coordinates in [-1, 1]:
-unit = (norm + 1) 42. Angles are degrees counter-clockwise in the tables, radians in the physics.
+unit = 42 * (norm + 1). Angles are degrees counter-clockwise in the tables, radians in the physics.
 
 A task of your own is one more entry of TASKS, for instance right after the table:
 
@@ -38,7 +42,7 @@ A tool class of your own is an entry of OWN_KINDS. Its tools get the ids after a
 
 Every split divides them 2:1:1 separately, so that no other tool changes its part; but
 `engineered_representations` gets a column more and other standardised numbers. What a class does to
-a ball is a contact rule (`make_space`). pymunk prints an exception that a rule raises and goes on.
+a ball is a contact rule (`make_space`). If one raises an exception, pymunk prints it and goes on.
 """
 
 import io
@@ -66,7 +70,7 @@ WORLD = 84.0  # A.3: the screen is 84 x 84; [code] physics units are its pixels
 GRAVITY = (0.0, -2.0)  # [code] units/s^2
 DT = 1 / 30  # [code] seconds per physics step
 SUBSTEPS = 40  # A.3 "acts every 40 physics simulation steps"
-SLEEP_TIME = 0.3  # [code] s: a ball at rest this long is put to sleep
+SLEEP_TIME = 0.3  # [code] s: pymunk leaves out a ball at rest this long, until it is hit
 MAX_ACTIONS = 30  # A.3 and Table 3 "max. episode length"
 NUM_AVAILABLE = 50  # Table 3 "actions per episode"; the no-op is one of them
 NUM_FRAMES = 3  # A.3 "past 3 frames are stacked channel-wise"
@@ -80,35 +84,31 @@ LAMBDA_OVERLAP = -0.01  # Eq. 3
 
 MIN_TOOL_GAP = 0.3  # [code] norm: tool centres this close "overlap"
 # A.3 "no moving objects" [code]: an action is still if at its end no body's centre is faster than
-# this. The second still action ends the episode, even if others lie between: after the first one
-# the agent can set things going again.
+# this. One still action is forgiven, because the agent may set things going again. The second ends
+# the episode, even if others lie between: [code] never resets the count, and so it is here.
 STILL_SPEED = 0.05  # units/s
 STILL_ACTIONS = 2
-HIT_DISTANCE = 0.03  # [code] share of the screen's diagonal: moved this far, the target is hit
+HIT_DISTANCE = 0.03  # [code] share of the screen's diagonal, 3.56 units: the target hit
 PICTURE_EVERY = 8  # [here] physics steps between colour pictures: 5 pictures per action
 
 BALL_RADIUS = 4.0  # [code] units: target, marker, goal and probe ball
 BALL_MASS = 10.0  # [code]
-PLANK_MASS = 10.0  # [code] levers and see-saws ...
-PLANK_MOMENT = 10_000.0  # [code] ... are very sluggish
-LADDER_LEAN = 4.0  # [code] a ladder multiplies the sideways part of its motion by this
-VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; no feature of them
+PLANK_MASS = 10.0  # [code] of levers and see-saws
+PLANK_MOMENT = 10_000.0  # [code] a rod of 20 units would have 333, so planks turn slowly
+LADDER_LEAN = 4.0  # [code] sideways a ladder carries so many times faster than its angle says
+VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; not among the engineered features
 
 METRIC = "success"  # the goal was reached in the episode (0 or 1)
 MODALITIES = ("state", "xy", "video")  # the first is the default; see action_observations
 SPLITS = ("default", "random", "full", "analysis")  # of `split_actions`, the default first
 NO_OP = 0  # id of the no-operation action
-# For hvae.py: it models first states as (x - centre) / half_width and moves between states as
-# dx / step. `step` is the unit of motion, 4 pixels: [here] the finest deviation of its decoder,
-# exp(-4 / 2) = .135 step, is then about half a pixel.
-UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
 # ---- A.3 actions: the tools ----
 
-# Collision types: pairs of them have rules (`make_space`). Level balls and loose boxes (MOVING)
-# and planks move; the tools Ball and Bouncy Ball are fixed discs. Balls pass through SENSORS: only
-# the rule acts.
+# Collision types: when two objects touch, the rule of their two types acts (`make_space`). Level
+# balls and loose boxes are MOVING, planks turn, and all else is fixed, the tools Ball and Bouncy
+# Ball too. Balls pass through SENSORS: there is no bounce, only the rule acts.
 PLAIN, MOVING, PLANK, FUNNEL, BUCKET, GOAL, CANNON, FAN, BELT, LADDER = range(10)
 SENSORS = (GOAL, CANNON, FAN, BELT, LADDER)
 
@@ -120,7 +120,7 @@ class Tool(NamedTuple):
     elasticity: float = 0.0
     angle: float = 0.0  # degrees
     size: float = 0.0  # units: length of segments and planks, radius of discs and polygons
-    damping: float = 0.0  # a ball on a plank keeps 2 - damping of its speed at every physics step
+    damping: float = 0.0  # of planks: 1.05 takes 5 % of a ball's speed at every step; <= 1: none
     max_angle: float = 0.0  # degrees: see-saws turn by so much to both sides
     mass: float = 0.0  # of balls and boxes; of the weight on one end of a see-saw
     left_up: bool = False  # True: a see-saw's left end starts up, the weight sits on the right one
@@ -136,7 +136,7 @@ class Kind(NamedTuple):
     colour: str  # as people see it; the policy sees the grey that Pillow makes of it
     contact: int = PLAIN
     sides: int = 0  # of polygons
-    radius: float = 1.0  # units: half the thickness of segments
+    radius: float = 1.0  # units, of segments: half of [code]'s thickness (1, 2, 2.5), rounded down
     # Degrees: angles stay below it, because the shape is the same again after this turn. See-saws
     # have limits in place of angles: [code] below 60 with a weight, below 90 without.
     turn: int = 360
@@ -155,12 +155,12 @@ SOFT = (0.1, 0.3, 0.5)  # elasticities
 BOUNCY = (0.8, 1.0, 1.2)
 LENGTHS = (6, 10, 14, 18, 22)
 PLANK_LENGTHS = (12, 14, 16, 18, 20)
-# A damping of 1 does nothing; it is among the features of ramps (`engineered_representations`).
+# [code] Ramps have a damping of 1, which does nothing, as a number for their engineered features.
 RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)}
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# A square at 45 degrees is an upright box, and [code] has boxes as a class (which no split uses).
+# No squares at 45 degrees: [code] has these upright boxes as a class of its own, in no split.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. Planks and ball tools have no friction: [code] forgets to set it.
@@ -176,7 +176,8 @@ BALLS = {"elasticity": (0.1, 0.2, 0.3, 0.4, 0.5), "size": (3, 5, 7, 9), "frictio
 BOUNCY_BALLS = {"elasticity": (0.8, 0.9, 1.0, 1.1, 1.2), "size": (3, 5, 7, 9), "friction": (0,)}
 BELTS = {"size": range(6, 25, 2), "speed": (1, 2, 3, 4, 5, 6, -1, -2, -3, -4, -5, -6)}
 
-# Colours whose greys (0.299 R + 0.587 G + 0.114 B) are those that [code] shows to the policy.
+# Colours whose greys (0.299 R + 0.587 G + 0.114 B) are those that [code] shows to the policy, which
+# mirrors its pictures and takes some from image files; [here] all are flat shapes.
 ORANGE = "#fa8535"
 BLUE = "#086788"
 WOOD = "#fa9149"
@@ -185,9 +186,9 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    "No-op": Kind("disc", GREEN, GOAL),  # never drawn or placed; see NO_OP_RADIUS
-    # The tools, in the order of their ids: learned tables and runs rely on it. Down to the bucket
-    # they are those of the Default Split.
+    "No-op": Kind("disc", GREEN, GOAL),  # never drawn or placed; for the probe ball: NO_OP_RADIUS
+    # The tools in the order of their ids, which saved representations and runs rely on. Down to the
+    # bucket they are those of the Default Split.
     "Ramp": Kind("segment", ORANGE, turn=180, vary=RAMPS),
     "Trampoline": Kind("segment", "#47659f", turn=180, vary=TRAMPOLINES),
     "Triangle": Kind("polygon", ORANGE, sides=3, turn=120, vary=SOLIDS),
@@ -218,8 +219,8 @@ KINDS = {
     "Goal star": Kind("polygon", GREEN, GOAL, sides=5),
     "Basket": Kind("box", "#f2a98c", GOAL),
     "Subgoal": Kind("disc", "#d3feb9", GOAL),
-    "Thin line": Kind("segment", STEEL, radius=0),  # [code] thickness 1
-    "Line": Kind("segment", STEEL),  # [code] thickness 2 and 2.5
+    "Thin line": Kind("segment", STEEL, radius=0),
+    "Line": Kind("segment", STEEL),
     "Boundary": Kind("segment", "#b0c4de"),
     "Ladder": Kind("segment", "#cc9a64", LADDER),
 }
@@ -242,13 +243,13 @@ FINE_KINDS = [name for name in PAPER_KINDS if name in TABLE_1 and KINDS[name].va
 
 def _tools_of(name: str, step: int = COARSE_STEP) -> list[Tool]:
     """All tools of one class, their angles `step` degrees apart."""
-    # appendix: no two tools within 15 degrees. A pentagon repeats after 72 degrees, so its 60 and 0
-    # are only 12 apart. [code] keeps them, and needs them for its 2,111; [here] as [code].
+    # appendix: no two tools within 15 degrees; [code] has pentagons at 0 and 60, 12 apart as they
+    # repeat after 72; [here] as [code], because the 2,111 need them.
     kind = KINDS[name]
     choices = dict(kind.vary)
     for parameter in kind.vary.keys() & ANGULAR:
         values = kind.vary[parameter]
-        if step == FINE_STEP:
+        if step == FINE_STEP:  # the same range in smaller steps
             values = range(values.start, values.stop, step)
         choices[parameter] = [value for value in values if value < kind.turn]
     rows = product(*choices.values())
@@ -257,9 +258,9 @@ def _tools_of(name: str, step: int = COARSE_STEP) -> list[Tool]:
 
 def _all_tools() -> list[Tool]:
     """Every tool; its place in the list is its id."""
-    # 0 is the no-op; 1..2,110 are the tools of the Default Split, with the no-op A.3's 2,111;
-    # 2,111..2,325 are in the Full Split alone. appendix: lever, ball and belt are among the 2,111;
-    # [code] its 2,111 hold none of them; [here] as [code], because with them it would be 2,326.
+    # Id 0 is the no-op, ids 1 to 2,110 are the Default Split: together they are A.3's 2,111 tools.
+    # Ids 2,111 to 2,325 are in the Full Split alone. appendix: lever, ball and belt are among the
+    # 2,111; [code] they are not; [here] as [code], because with them it would be 2,326.
     tools = [Tool("No-op")]
     for name in PAPER_KINDS:
         tools += _tools_of(name)
@@ -274,10 +275,11 @@ def _all_tools() -> list[Tool]:
 
 TOOLS = _all_tools()
 NUM_ACTIONS = len(TOOLS)  # 8,359 distinct tools over all splits
-# Arrays (NUM_ACTIONS,): the class; the angle in degrees (of see-saws the limit, 0 without angles);
-# is it one of the tools 15 degrees apart (limits 5, 20, ...), not one that the analyses add?
+# Arrays (NUM_ACTIONS,): the class; the angle in degrees (of see-saws the limit, 0 without angles).
 TOOL_KINDS = np.array([tool.kind for tool in TOOLS])
 TOOL_ANGLES = np.array([tool.max_angle or tool.angle for tool in TOOLS])
+# Is it one of the tools 15 degrees apart (limits 5, 20, ...), not one that the analyses add? All
+# angles are multiples of 3, so they never leave 5; all limits are 5 + 3k, so they never leave 0.
 IS_COARSE = np.isin(TOOL_ANGLES % COARSE_STEP, (0, FIRST_LIMIT))
 IS_COARSE |= np.isin(TOOL_KINDS, list(OWN_KINDS))
 
@@ -291,14 +293,14 @@ TOOL_CLASSES = tuple(dict.fromkeys(action_labels()[1:].tolist()))  # without the
 
 
 def engineered_representations() -> np.ndarray:
-    """Ground-truth features of every tool, float32 (NUM_ACTIONS, 30) ([code]; B "engineered").
+    """Ground-truth features of every tool, float32 (NUM_ACTIONS, 30).
 
-    One-hot of the 21 classes in alphabetical order, then elasticity, angle (rad), size, damping,
-    largest angle (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are
-    15 degrees apart (over the 2,111 alone the speed would be constant).
+    B describes "engineered" representations for Grid World; for CREATE they are [code]'s: one-hot
+    of the 21 classes (20 and the no-op), then elasticity, angle (rad), size, damping, largest angle
+    (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are 15 degrees
+    apart (over the 2,111 alone the speed would be constant).
     """
-    # [code] has 23 classes (two of boxes) in an order that changes from run to run. [here] they are
-    # sorted and without the boxes, because no split uses these. Friction is not among its numbers.
+    # [code] orders the classes anew in every run. [here] they are sorted, and without its boxes.
     one_hot = TOOL_KINDS[:, None] == np.unique(TOOL_KINDS)  # (NUM_ACTIONS, 21)
     numbers = np.array([tool[1:10] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])  # the angles
@@ -310,8 +312,10 @@ def engineered_representations() -> np.ndarray:
 # ---- A.3: the action set and its splits, Table 1 ----
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
-# see-saws the largest angle). The paper's main results come from it. Other draws may be harder: in
-# 1.9 % of them all cannons of 120 to 180 degrees are training tools, so the test has none.
+# see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
+# paper's main results come from this draw. Others may be harder: in C(19, 7) / C(24, 12) = 1.9 % of
+# them all five cannon angles from 120 to 180 degrees are for training. Then no test tool shoots up
+# and well to the left, where most goals are.
 TRAINING_ANGLES = {
     ("Ramp", "Trampoline"): (45, 60, 75, 90, 105, 165),
     ("Triangle", "Bouncy Triangle"): (30, 45, 60, 105),
@@ -345,10 +349,10 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; all tools are 3 degrees apart |
 
     `seed` also draws which held-out tools are for validation, which for the test. The parts are
-    disjoint. The no-op (id 0) is in none of them, because it is always available. The paper's
-    totals count it: 2,111 = 2,110 + 1 (default), 762 = 761 + 1 (analysis, training), 1,739 =
-    1,737 + 2 (full, once in training and once held out). Left out: default and random have no
-    balls, bouncy balls, levers or belts; full has no 4- to 6-sided polygons; analysis has neither.
+    disjoint. The no-op (id 0) is in none of them, because it is always available. The paper counts
+    it: once in the 2,111 of the default split and in the 762 training tools of the analyses, twice
+    in the 1,739 of the Full Split (in training and held out). Default and random have no balls,
+    bouncy balls, levers or belts, full has no 4- to 6-sided polygons, analysis has none of these.
     A class of your own is in every split, half of the values of its first parameter in training.
     """
     if split not in SPLITS:
@@ -362,8 +366,8 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         pool = IS_COARSE & np.isin(TOOL_KINDS, TABLE_1)
         train = IS_COARSE & np.isin(TOOL_KINDS, TABLE_1_TRAIN)
     elif split == "analysis":
-        # appendix: 7,566 tools, "at least 15 degrees" between the 762 training tools; [code] 7,555
-        # and the no-op, 30 degrees. [here] as [code]: only 30 degrees give 762, 7,566 is a slip.
+        # appendix: 7,566 tools, "at least 15 degrees" between the 762 training tools; [code] 7,556
+        # with the no-op, and 30 degrees; [here] as [code], because only 30 degrees give 762.
         pool = np.isin(TOOL_KINDS, FINE_KINDS)
         train = pool & np.isin(TOOL_ANGLES % 30, (0, FIRST_LIMIT))  # see-saws: limits 5, 35, 65
     else:
@@ -439,18 +443,18 @@ class Item(NamedTuple):
 
 @dataclass(frozen=True)
 class Task:
-    """One level. With a marker ball the target has to be hit before the goal counts."""
+    """One level. With a marker ball the goal counts only from the target hit on."""
 
     items: tuple[Item, ...]
     target: Item
     goal: Item
     marker: Item | None = None
     # Half ranges (norm) of uniform shifts of x and y (one number: of both), drawn once per name at
-    # every reset: for target, goal and marker, and for the items that name them.
+    # every reset: for target, goal and marker, and for the items with this name as their `shift`.
     shifts: dict[str, float | tuple[float, float]] = field(default_factory=dict)
     subgoals: tuple = ()  # places (norm), for the marker if there is one, else the target
     walls: tuple[Item, ...] = ()  # at the edges of the screen; there is never a floor
-    marker_must_hit: bool = False  # the target hit counts only after marker and target have touched
+    marker_must_touch: bool = False  # no target hit before marker and target have touched
     target_hit_reward: float = LAMBDA_TARGET_HIT
     goal_on_either_side: bool = False  # the goal's x changes sign with probability 1/2
     max_actions: int = MAX_ACTIONS
@@ -500,7 +504,8 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # The marker rolls down, has to pass a stack of boxes and the subgoal, and to come back below.
+    # The marker rolls down to the right. It has to pass a stack of boxes and the subgoal, and to
+    # come back below to the target, which then rolls down to the star.
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
@@ -508,11 +513,10 @@ TASKS = {
                box(-0.7, 0.3), box(-0.7, 0.2), line(-0.6, 0.18, 15, 90), line(-0.8, 0.18, 15, 90),
                line(0.35, 0.8, 15, 90), box(0.25, 0.93), box(0.25, 0.83), line(0.15, 0.8, 15, 90)),
         shifts={"marker": 0.02, "target": (0.02, 0.0)},
-        subgoals=((0.7, -0.1),), walls=ROOM, marker_must_hit=True,
+        subgoals=((0.7, -0.1),), walls=ROOM, marker_must_touch=True,
         target_hit_reward=2.0,  # appendix: 1; [code] 2; [here] as [code]
         max_actions=50),  # appendix: 30; [code] 50; [here] as [code], the published task
-    # The target has to get left of the wall, past the see-saw that closes the way. It may start in
-    # touch with the ceiling [code]. The heavy ball has a shift of its own, "ball".
+    # The target has to get left of the wall. A see-saw closes the way until its left end is loaded.
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9), goal=star(-0.8, -0.8),
         items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
@@ -520,13 +524,13 @@ TASKS = {
                     friction=0),
                line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20)),
         shifts={"ball": 0.05, "target": 0.1}, subgoals=((-0.1, -0.45),), walls=ROOM),
-    # The marker lies on a long floor: move it over the edge, then the target back to the left.
+    # The marker falls onto a long floor: move it over the edge, then the target back to the left.
     "navigate": Task(
         marker=ball("Marker", -0.6, 0.75), target=ball("Target", 0.1, -0.24),
         goal=star(-0.65, -0.59), shifts={"target": 0.1, "goal": 0.2},
         items=(line(0.1, -0.35, 16, shift="target"), line(-0.65, -0.7, 16, shift="goal"),
                line(-0.5, 0.1, 40))),
-    # Two belts carry the ball to the left; under the floor it has to come back to the right.
+    # Two belts carry the ball to the left, above the floor; the third, below, back to the right.
     "belt": Task(
         target=ball("Target", 0.75, 0.75, size=3), goal=star(0.5, -0.7),
         items=(belt(0.55, 0.25, speed=-2.5), belt(0.05, 0.2, speed=-2.5),
@@ -547,7 +551,7 @@ TASKS = {
         items=(line(-0.1, 0.35, 55, 90), item("Cannon", -0.1, -0.8, angle=110, force=140),
                line(0.4, 0.0, 8, shift="target")),
         shifts={"marker": 0.1, "target": 0.05, "goal": 0.05},
-        walls=(RIGHT_WALL, CEILING), marker_must_hit=True),
+        walls=(RIGHT_WALL, CEILING), marker_must_touch=True),
     # Two balls fall on two sides of a wall: make them meet.
     "collide": Task(
         target=ball("Target", 0.6, 0.7), goal=ball("Goal ball", -0.6, 0.7),
@@ -572,7 +576,6 @@ TASKS = {
         max_actions=40),  # appendix: 30; [code] 40; [here] as [code]
     # Into the funnel of the chamber with the star; a ball between the chambers is lost.
     "funnel": Task(
-        # [code] from (0, 0.9) both coordinates are shifted by U(-0.2, 0.05): the same places
         target=ball("Target", -0.075, 0.825), goal=star(-0.28, -0.8),
         items=chamber(1) + chamber(-1), shifts={"target": 0.125}, goal_on_either_side=True),
 }
@@ -592,13 +595,16 @@ def to_units(norm):
 
 
 # (along, across) units; other boxes are squares. [code] swaps two arguments, so that a cannon's
-# contact box never turns. [here] it turns with the aim. This changes only where it catches a ball,
-# not where or how fast it shoots.
+# contact box never turns. [here] it turns with the aim, as its picture does. This changes only
+# where it catches a ball, not where or how fast it shoots.
 BOX_SIZE = {"Cannon": (10.0, 7.3), "Fan": (6.7, 10.0)}
 MUZZLE = (5.0, 3.65)  # [code] units: times (cos, sin) of the aim, where balls are shot from
-LAST_CORNER = {"Funnel": 30, "Bucket": 45}  # [code] degrees: where it is at tool angle 0
-# The no-op has nothing to touch. For the probe ball alone it is a disc to fly through: [code] a
-# ball is near within 0.1 sqrt(8) norm of the place, 11.9 units.
+# [code] Funnels and buckets are open between their last corner and their first. At tool angle 0 a
+# funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees (right rim), a bucket's at 135 (left
+# rim), 225, 315 and 45 degrees (right rim).
+LAST_CORNER = {"Funnel": 30, "Bucket": 45}
+# [code] The probe ball touches the no-op when its centre is within 0.1 sqrt(8) norm, 11.9 units. A
+# disc smaller by the ball's radius is touched exactly then; as a GOAL it does nothing to the ball.
 NO_OP_RADIUS = 0.1 * sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
@@ -646,9 +652,8 @@ class SceneObject:
         self.touched = False  # ... and whether it came
         self.held_by = None  # the bucket that has caught a ball
 
-        # Level balls, loose boxes and planks move: each has a body, and its shape is given around
-        # that body's centre. All else, the tools Ball and Bouncy Ball too, is a part of the space's
-        # static body, and its shape is given in the world.
+        # What moves has a body of its own, and its shape is given around that body's centre. All
+        # else is a part of the space's static body, and its shape is given in the world.
         self.body = None
         if kind.contact == PLANK:
             self.body = pymunk.Body(PLANK_MASS, PLANK_MOMENT)
@@ -666,7 +671,7 @@ class SceneObject:
             shape = pymunk.Circle(body, tool.size or NO_OP_RADIUS, origin)
         elif kind.shape == "segment":
             shape = pymunk.Segment(body, *self.corners, kind.radius)
-        elif self.body:  # a loose box
+        elif self.body:  # a loose box, the only polygon that moves
             shape = pymunk.Poly.create_box(body, (tool.size, tool.size))
         else:
             shape = pymunk.Poly(body, self.corners)
@@ -689,8 +694,8 @@ class SceneObject:
 
     def _fixtures(self, static_body: pymunk.Body) -> list:
         """What holds a plank at its pivot and limits its turn; the weight on its end, if any."""
-        # [code] has a pin joint of length zero and a slide joint. [here] the joints that pymunk has
-        # for the purpose: with them the centre stays put. On average balls move as in [code].
+        # [code] has a pin joint of length zero and a slide joint, and the centre drifts. [here] the
+        # joints made for this. On average over 800 launches per class balls move as in [code].
         fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
         if self.tool.max_angle:
             # The tilt at the start is part of the segment: the body starts at angle 0.
@@ -699,7 +704,7 @@ class SceneObject:
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
-            # [code] The weight has no shape, so nothing hits it; mass and moment are one number.
+            # [code] Nothing hits it, for it has no shape. The gear turns it as the plank turns.
             weight = pymunk.Body(self.tool.mass, self.tool.mass)
             weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
@@ -709,9 +714,9 @@ class SceneObject:
 
 # ---- the physics: what happens when two objects touch ----
 
-# In these rules `mover` is the ball or loose box that touches something. pymunk prints and
-# swallows an exception raised in a rule, so each is a few plain assignments. `process_collision`
-# lasts as long as the contact: a rule that decides anew at every step must write True and False.
+# In these rules `mover` is the ball or loose box that touches something. `process_collision` False
+# lets the two pass through each other, and stays False as long as they touch: a rule that decides
+# anew at every step must write True and False.
 
 
 def _put_at_rest(body: pymunk.Body, position: tuple[float, float]) -> None:
@@ -752,8 +757,8 @@ def _on_fan(arbiter, space, data) -> None:
     """A fan blows with the same force anywhere in its box."""
     mover, fan = (shape.owner for shape in arbiter.shapes)
     push = Vec2d.from_polar(fan.tool.force, radians(fan.tool.angle))
-    # [code] turns the force with the ball as it rolls, the package does not; [here] as the package,
-    # because wind does not turn with a ball.
+    # [code] turns the force with the ball as it rolls. [here] not, because wind does not turn with
+    # a ball; so it is in the authors' separate release of CREATE.
     mover.body.apply_force_at_world_point(push, mover.body.position)
 
 
@@ -763,6 +768,7 @@ def _on_funnel(arbiter, space, data) -> None:
     left, nozzle, right = (dist(mover.body.position, corner) for corner in funnel.corners)
     caught = mover.held_by is None and nozzle > left and nozzle > right
     if caught:
+        # At the nozzle it is not caught again: the funnel, solid now, pushes it out.
         _put_at_rest(mover.body, funnel.corners[1])
     arbiter.process_collision = not caught
 
@@ -776,17 +782,18 @@ def _on_bucket(arbiter, space, data) -> None:
         if max(top_left, top_right) < min(low_left, low_right):
             mover.held_by = holder
     if mover.held_by is holder:
-        # [code] resets the position alone, so that the ball's speed grows without end, the package
-        # also stops it; [here] as the package.
+        # [code] resets the position alone, and the ball's speed grows without end. [here] it is
+        # stopped as well, as in the authors' separate release of CREATE.
         _put_at_rest(mover.body, holder.place)
     arbiter.process_collision = mover.held_by is None
 
 
 def _on_plank(arbiter, space, data) -> None:
-    """A damping above 1 slows a ball at every step."""
+    """A damping above 1 slows a ball at every step: 1.05 takes 5 % of its speed [code]."""
     mover, plank = (shape.owner for shape in arbiter.shapes)
     keep = 2.0 - plank.tool.damping
-    if mover.kind.shape == "disc" and keep < 1.0:  # writing a speed wakes a sleeping ball
+    # With a damping of 1 nothing is written, because that would wake a sleeping ball.
+    if mover.kind.shape == "disc" and keep < 1.0:
         mover.body.velocity = mover.body.velocity * keep
         mover.body.angular_velocity *= keep
 
@@ -797,7 +804,9 @@ def make_space() -> pymunk.Space:
     space.gravity = GRAVITY
     space.sleep_time_threshold = SLEEP_TIME
     # begin: once per contact; pre_solve and post_solve: at every step of it, before and after
-    # pymunk computes the forces.
+    # pymunk computes the forces. Goals at every step, because `_judge` forgets the touch after each
+    # action; two balls once, because a marker's touch is kept and a goal ball's ends the episode.
+    # Planks after the forces, because they damp the speed that a ball has then.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
@@ -819,8 +828,6 @@ INK = "#3b3a44"
 
 class Canvas:
     """A square picture of so many units: grey on white for the policy, in colour for people."""
-
-    # [code] mirrors its picture and needs image files; [here] flat shapes in nearly the same greys.
 
     def __init__(self, size: int, in_colour: bool, units: float = WORLD):
         self.in_colour = in_colour
@@ -936,14 +943,14 @@ class CreateEnv(gym.Env):
     ## Observation Space
     `state`, Box(0, 255, (3, 84, 84), uint8): the last 3 grey pictures, newest last; after reset the
     two older ones are black. `available`, Box(0, NUM_ACTIONS - 1, (K,), int64): the no-op and
-    K - 1 tools, drawn without replacement from the pool at every reset; if the pool has no more,
-    all in sorted order.
+    K - 1 tools, drawn without replacement from the pool at every reset. A pool of only K - 1 tools
+    is available as it is, sorted.
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a tool that is refused.
-    In tasks with a marker (blue) the goal counts only at the target hit or later. That is the first
-    time the target (red) is more than 3.56 units from its start, whatever moved it: +1 (obstacle:
-    +2). In obstacle and cannon the marker must also have touched it.
+    In tasks with a marker the goal counts only from the target hit on. This pays +1 (obstacle: +2)
+    and is the first time that the target is more than 3.56 units from its start, whatever moved it;
+    in obstacle and cannon the marker must also have touched it.
 
     ## Episode End
     Terminated: goal reached; target off the screen; marker off the screen before the target hit;
@@ -952,11 +959,11 @@ class CreateEnv(gym.Env):
 
     ## Arguments
     `action_pool` ids (default: training split), `num_available` K, `task` of TASKS;
-    `subgoal_reward=False` pays neither subgoals nor target hit (C.3). What does not exist of these,
-    and bad actions, raise ValueError and change nothing.
+    `subgoal_reward=False` pays neither subgoals nor target hit (C.3). An unknown id or task, too
+    many available, or a bad action raises ValueError and changes nothing.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # four times as fast as the world
 
     def __init__(self, action_pool=None, num_available=NUM_AVAILABLE, render_mode=None,
                  task="push", subgoal_reward=True):  # fmt: skip
@@ -981,15 +988,13 @@ class CreateEnv(gym.Env):
         """Start an episode with newly drawn available tools; returns (observation, {})."""
         super().reset(seed=seed)
 
-        # Subsampling: every episode has its own few tools of the pool. If all of them are to be
-        # available, nothing is drawn. (Only for tests of the Full Split [code] draws a class first,
-        # then a tool of it; the appendix names no such way.)
+        # Subsampling: every episode has its own few tools of the pool. If all are to be available,
+        # nothing is drawn. (In tests of the Full Split [code] draws a class, then a tool of it.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
         self.available = np.concatenate([[NO_OP], tools])  # (K,)
 
-        # All objects are at rest, and nothing has been placed.
         self._build_level()
         self._actions = 0
         self._centres = []  # norm, of the tools placed so far
@@ -1002,7 +1007,6 @@ class CreateEnv(gym.Env):
         self._still = 0  # actions that ended without motion; it only grows
         self._over = False
 
-        # The first observation is the picture of the level after two black ones.
         self._frames = np.zeros((NUM_FRAMES, 84, 84), np.uint8)
         observation = self._observe()
         self._pictures = []
@@ -1064,8 +1068,7 @@ class CreateEnv(gym.Env):
         if self._over:
             raise gym.error.ResetNeeded("the episode is over (or none began): call reset()")
 
-        # Place: the chosen tool goes where the agent wants it, or is refused. Either way, and after
-        # the no-op too, time goes on.
+        # Place: the chosen tool goes where the agent wants it, or is refused. Time goes on anyway.
         self._tool = TOOLS[self.available[choice]]
         self.placement = self._place(position.tolist())
         self._actions += 1
@@ -1097,8 +1100,8 @@ class CreateEnv(gym.Env):
         # that its penalty never fires; [here] as the appendix.
         if max(map(abs, position)) > 1.0:
             return "outside"
-        # appendix: "overlap over existing objects"; [code] this distance to earlier tools, or
-        # contact of the exact shapes with anything in the scene; [here] as [code].
+        # appendix: "overlap over existing objects"; [code] refuses a tool that is so near to an
+        # earlier one, or whose exact shape touches anything in the scene; [here] as [code].
         if any(dist(position, centre) <= MIN_TOOL_GAP for centre in self._centres):
             return "too close"
         place = Vec2d(*map(to_units, position))
@@ -1116,16 +1119,16 @@ class CreateEnv(gym.Env):
     def _judge(self) -> tuple[bool, int, bool]:
         """What this action achieved: (goal reached, subgoals reached, target hit just now)."""
         # First the target hit: the target has moved far enough from its start, and the marker has
-        # touched it if the task asks for that. [code] Off the screen it is treated as at the edge.
+        # touched it if the task asks for that. [code] Off the screen it counts as at the edge.
         hit_now = False
         if not self._target_hit:
             place = np.clip(self._target.body.position, 0.0, WORLD)
             moved_far = dist(place, self._target.place) > HIT_DISTANCE * WORLD * sqrt(2)
-            hit_now = moved_far and (self._marker.touched or not self.task.marker_must_hit)
+            hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. [code]: a target that rolls over the goal before the hit wins at the hit.
-        # [here] only a touch in the action of the hit, or later, counts: the hit is the way there.
+        # Then the goal. [code]: a touch before the hit counts at the hit. [here] none of an earlier
+        # action, because the task is to reach the goal by the hit; within one the order is free.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1146,7 +1149,7 @@ class CreateEnv(gym.Env):
         # sums and takes 0.1 per placed tool from the rewards of goal and subgoals. [here] sums.
         reward = LAMBDA_ALIVE + REFUSED.get(self.placement, 0.0)
         reward += goal_reached * LAMBDA_GOAL  # an indicator of Eq. 3 is True or False, 1 or 0
-        # C.3 switches off the rewards of subgoals. The authors ran it in push too, which has none,
+        # C.3 switches off the rewards of subgoals. Figure 10 has push too, a task without subgoals,
         # so the reward for the target hit must have been meant as well.
         if self.subgoal_reward:
             reward += subgoals_reached * LAMBDA_SUBGOAL
@@ -1155,13 +1158,13 @@ class CreateEnv(gym.Env):
 
     def _ended(self) -> tuple[bool, bool]:
         """(terminated, truncated) after this action."""
-        # A ball that is still needed has left the screen (appendix: silent; [code] ends, too).
+        # [code] A ball that is still needed has left the screen.
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
-        # A.3 "no moving objects". Planks are in the list, but their centres rest on the pivot, so a
-        # turning plank counts as still. A see-saw's weight is not in it. A lost ball that falls for
-        # ever below the screen counts as moving [code]. A ball in a bucket is at rest, though
-        # gravity has just added 0.07 to its speed.
+        # A.3 "no moving objects" [code]. Planks are in the list, but their centres rest on the
+        # pivot, so a turning plank counts as still. A see-saw's weight is not in it. A ball that is
+        # not needed (the marker after the hit, the heavy ball) and falls for ever below the screen
+        # counts as moving. One in a bucket is at rest, though gravity has just sped it up by 0.07.
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
             self._still += 1
@@ -1200,7 +1203,6 @@ class CreateEnv(gym.Env):
             canvas.stroke([place], 0.8, colour)
         self._draw_objects(canvas, moving=True)
 
-        # One page: the scene, the caption under it, the three grey pictures beside it.
         size = PICTURE_SIZE
         page = Image.new("RGB", (size + 6 + size // 3, size + 30), "lightgrey")
         page.paste(Image.fromarray(canvas.picture()))
@@ -1243,7 +1245,11 @@ PROBE_SPEED = 12.5  # [code] units/s
 PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
-CELL = 1_000.0  # [here] units: trajectories run side by side in one space, too far apart to meet
+CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
+# For hvae.py: it models first states as (x - centre) / half_width and moves between states as
+# dx / step. It keeps its decoder's log-variance at -4 or more: a standard deviation of at least
+# exp(-4 / 2) = 0.135 steps, or 0.54 pixel, because [here] `step` is 4 pixels in norm.
+UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
 def action_observations(action_ids, num_observations, modality="state", seed=0, workers=1):
@@ -1255,9 +1261,9 @@ def action_observations(action_ids, num_observations, modality="state", seed=0, 
     | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm)                                    |
     | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same scenes                 |
 
-    appendix: (x, y); [code] learned all of its tables from "state"; [here] as [code].
-    n = `num_observations` (paper: 1,024). Frames are 1/3 s apart; the contact is near the middle.
-    The bytes for one tool depend on (seed, tool, n) only, not on `workers` or the other ids.
+    appendix: (x, y); [code] learned its tables from "state"; [here] as [code], they tell more.
+    n = `num_observations` (paper: 1,024). Frames are 1/3 s apart, the contact in the middle where
+    it can be. The bytes for one tool depend on (seed, tool, n) only, not on `workers` or other ids.
     "video" needs 16 MB per tool at n = 1,024. Raises ValueError for bad ids, modality or n.
     """
     check_ids(action_ids)
@@ -1304,7 +1310,7 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
         done = (contact > 0) & (hit | (attempt >= PROBE_ATTEMPTS - 1))
 
         # Keep 7 of 9 states, starting 3 before the touch, clipped to a start of 0..2; after a miss
-        # start at 1. So the touch is near the middle.
+        # start at 1. So the touch is in the middle, but for very early and late ones.
         touch = (contact[done] - 1) // PROBE_EVERY  # the first state recorded at the touch or later
         first = np.where(hit[done], np.clip(touch - 3, 0, 2), 1)
         columns = first[:, None] + np.arange(PROBE_LENGTH)  # (done, 7)
@@ -1426,12 +1432,12 @@ def draw_sheet(name: str, pool: np.ndarray):
             env = CreateEnv(task=task, render_mode="rgb_array")
             env.reset(seed=0)
             pictures[task] = env.render()[:PICTURE_SIZE, :PICTURE_SIZE]  # the scene
-    elif name == "tools":  # four tools of each class
+    elif name == "tools":  # four tools of each class, spread over its ids
         for label in TOOL_CLASSES:
             ids = np.flatnonzero((action_labels() == label) & IS_COARSE)
             four = ids[len(ids) // 10 :: ceil(len(ids) / 4)]
             pictures[label] = portraits([TOOLS[action] for action in four], columns=2)
-    else:  # three tools, each alone in the world
+    else:  # three tools from all over the pool, each alone in the world
         ids = np.unique(pool[[len(pool) // 8, len(pool) // 2, -1]])
         for action in ids:
             title = f"{TOOLS[action].kind}, id {action}"
