@@ -1260,7 +1260,6 @@ def action_observations(action_ids, num_observations, modality="state", seed=0, 
     | "state"  | float32 (len(ids), n, 7, 6): tool x, y, ball x, y (norm), ball velocity (norm/s) |
     | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm)                                    |
     | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same scenes                 |
-
     appendix: (x, y); [code] learned its tables from "state"; [here] as [code], they tell more.
     n = `num_observations` (paper: 1,024). Frames are 1/3 s apart, the contact in the middle where
     it can be. The bytes for one tool depend on (seed, tool, n) only, not on `workers` or other ids.
