@@ -1,40 +1,43 @@
 """Action representations: a hierarchical VAE over sets of action observations (appendix B, D.3.1).
 
 An action is known only by observations of what it does: a set X = {x_1 .. x_n} of trajectories,
-videos or pictures. One latent c explains the whole set, one latent z_j each observation. What all
-observations share (the action) lands in c; what differs (start cell, camera angle) lands in z.
+videos or pictures. One latent c explains what the set shares (the action), a latent z_j what is
+special to x_j (a ball's launch, a camera angle). Its first state s_j is given (a picture has none).
 
-        c ~ N(0, I)  ->  z_j ~ p(z | c)  ->  x_j ~ p(x | z_j, c, first state of x_j)
+        c ~ N(0, I)  ->  z_j ~ p(z | c)  ->  x_j ~ p(x | z_j, c, s_j)
+    ELBO per observation = mean_j [ log p(x_j | z_j, c, s_j) - KL(q(z_j | x_j, c) || p(z_j | c)) ]
+                           - KL(q(c | X) || N(0, I)) / |X|
 
-    ELBO per observation = mean_j [ log p(x_j | z_j, c) - KL( q(z_j | x_j, c) || p(z_j | c) ) ]
-                           - KL( q(c | X) || N(0, I) ) / |X|
-
-The representation of an action is the mean of q(c | X). The networks learn from training actions
-and CREATE's no-op only (those of the oracle encoder from all actions). Then every action of the
-split and the no-op are encoded, without re-training; other rows of the table stay zero.
+Only recipe paper uses this weight of the last term; quick and fast divide it by more than |X|
+(`kl_c_divisor`), a smaller weight as in a beta-VAE. The representation of an action is the mean of
+q(c | X). The networks learn from training actions and CREATE's no-op only (those of the oracle
+encoder from all actions). Then every action of the split and the no-op are encoded, without
+re-training: a table, one row per action. Actions in no part of the split keep a row of zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
     python hvae.py gridworld --train-on all      # the oracle encoder: trained on all actions
     python hvae.py create --modality video       # B: videos; B's Full Split: --split full
-    python hvae.py gridworld --recipe paper      # the numbers of Tables 3-4: days on a CPU
-    python hvae.py create --recipe quick --help  # the numbers of this recipe
+    python hvae.py gridworld --recipe paper      # Tables 3-4: days on a CPU; --help: its numbers
     python hvae.py my_env.py                     # an environment of your own, in a file
 
-Your file defines NUM_ACTIONS, MODALITIES; if needed SPLITS (names), NO_OP (an id), UNITS; and
+Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed SPLITS (names),
+NO_OP (an id), UNITS (see `prepare`); and
 
     split_actions(split, seed) -> {"train": ids, "valid": ids, "test": ids}
     action_labels() -> (NUM_ACTIONS,); engineered_representations() -> (NUM_ACTIONS, D)
-    action_observations(ids, count, modality, seed, workers) -> (len(ids), count, L, F) numbers
+    action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
-A modality "image" gives (..., S, S), "video" (..., L, S, S), greys 0-255, S 48 or 84; "onehot" two
-cells 0-79. Random numbers must depend on seed *and* id, for actions are recorded in several calls.
+An observation is (L, F), L states of F numbers each; but of modality "onehot" (L, 2), a cell's x
+and y as whole numbers 0-79; of "image" (S, S), "video" (L, S, S), greys 0-255, S 48 or 84. Random
+numbers must depend on seed *and* id, for actions are recorded in several calls.
 Marks in the comments: "appendix:" quotes the paper where sources differ; [code] is the authors'
 released implementation; [here] is this repository's choice, with its reason.
 """
 
 import hashlib
 import importlib
+import io
 import json
 import os
 import sys
@@ -49,21 +52,17 @@ import tyro
 from torch.distributions import Categorical, Normal, kl_divergence
 from tqdm import tqdm
 
-# Paper map: D.2 (Tables 3-4) -> Args, HYPERPARAMETERS, but for "MLP hidden layers": D.3.1 has each
-# depth. D.3.1 -> the networks, in its order; its loss -> ObservationModel.forward. B -> prepare,
-# HVAE, VAE; D.1 -> fit; Figures 4-6 -> plot_tsne.
-# Shapes: A actions in a batch, N recorded observations of each, n of them in an update, B = A * n;
-# L states per trajectory (the first is given, T = L - 1 are predicted), F numbers per state; C = Z
-# sizes of c and z; H hidden width; S side of a picture.
+# Paper map: D.2 (Tables 3-4) -> Args, HYPERPARAMETERS; D.3.1 -> the networks, in its order; D.3.1's
+# loss -> ObservationModel.forward; B -> prepare, HVAE, VAE; D.1 -> fit; Figures 4-6 -> plot_tsne.
+# Table 4's "MLP hidden layers 3" is no option: D.3.1 gives each MLP its depth; the code follows.
+# Shapes: A actions in a batch, N recorded observations of each, n in an update, B = A * n; L states
+# of F numbers per trajectory, the first given, T = L - 1 predicted; C = Z sizes of c, z; H hidden
+# width; E of an encoded observation: H, or H + L * F with the linear path; S side of a picture.
 
 # Name on the command line -> module. (The Recommender has nothing to record, so no encoder.)
 ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
-# Scale of relative trajectories, if an environment has no UNITS of its own. First states lie within
-# centre +- half_width; `step` is the unit of moves. What two actions do should differ by more than
-# 0.135 of it, for the decoder's sigma is never below exp(-4 / 2) = 0.135.
-UNITS = dict(centre=0.0, half_width=1.0, step=1.0)
 VISUAL = ("image", "video")  # modalities that pass the convolutions; all others are trajectories
 CLASSES = 80  # B: "two 80-dimensional one-hot vectors"
 RECIPES = ("quick", "fast", "paper")
@@ -74,11 +73,11 @@ class Args:
     """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
 
     env: Annotated[str, tyro.conf.Positional]  # gridworld, create, stacking, or a file: my_env.py
-    modality: str  # gridworld: xy, onehot; create: xy, state (six numbers), video; stacking: image
+    modality: str  # gridworld: xy, onehot; create: state (six numbers), xy, video; stacking: image
     recipe: Literal[RECIPES]  # which column of HYPERPARAMETERS gives the numbers
     hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline (B)
     train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, sees held-out actions
-    linear_path: bool = False  # the mean of a latent has a linear part, too (not in the paper)
+    linear_path: bool = False  # the mean of c (VAE: of z) has a linear part (not the paper's)
     split: str = "default"  # name of the split of the actions: default, full, ...
     split_seed: int = 0  # seed of the split
     seed: int = 0  # seed of weights, batches and latent samples
@@ -93,39 +92,37 @@ class Args:
     q_hidden: int  # width of q(c|X)
     observations: int  # recorded of each action; its representation comes from all of them
     batch_observations: int  # observations of each action in an update
-    kl_c_divisor: int  # divides KL(q(c|X) || N(0, I)); in the exact ELBO: batch_observations
-    relative: bool  # trajectories relative to their first state, instead of raw
-    kl_warmup: float  # share of the updates in which the weight of the KLs climbs to 1
-    compact_lstm: bool  # a Bi-LSTM of half the width, its directions concatenated
+    kl_c_divisor: int  # divides KL(q(c|X) || N(0, I)); in the ELBO: batch_observations
+    relative: bool  # trajectories (not pictures, videos) relative to their first state
+    kl_warmup: float = 0.0  # share of the updates in which the weight of the KLs climbs to 1
+    compact_lstm: bool  # a Bi-LSTM of half the width, directions concatenated (none in pictures)
     log_var_start: float | None  # first log-variance of the decoder (None: drawn from N(0, 1))
     log_var_rate: float  # factor on the learning rate of log-variances that are parameters
 
 
 # ---- Tables 3 and 4 ----
 
-# What each row means: Args, above. "paper" has the numbers of the tables; "fast", the default,
-# takes minutes on a CPU, more for pictures; "quick" is a first try. Counts and rates of these two
-# are [here]: tried by hand, judged by the scores of `probe` on held-out actions.
+# Args explains the rows. "paper" has the tables' numbers; "fast", the default, takes minutes on a
+# CPU, more for pictures; "quick" is a first try. Counts and rates of these two are [here]: tried by
+# hand, judged by the scores of `probe` on held-out actions.
 # fmt: off
 HYPERPARAMETERS = {  # columns: quick, fast, paper
     "representation_size": (16,    16,    16),      # Table 3
     "batch_size":          (128,   128,   128),     # Table 3
     "epochs":              (0,     0,     10_000),  # Table 3
-    "updates":             (500,   2_750, 0),
+    "updates":             (2_000, 2_750, 0),
     "learning_rate":       (1e-3,  1e-3,  1e-3),    # Table 4
     "hidden":              (64,    64,    64),      # Table 4
     "q_hidden":            (128,   128,   128),     # Table 4
     "observations":        (64,    1024,  1024),    # Table 4
     # Observations of one action differ little: many small updates teach more than few large ones.
-    # appendix: 1,024; [code] 45 to 672; [here] "paper" takes all, 11 GB of memory in Grid World.
+    # appendix: 1,024 (recorded or used?); [code] 45 to 672; [here] "paper" uses all, in 11 GB.
     "batch_observations":  (4,     4,     1024),
-    # The exact ELBO divides this KL by the number of observations in the update (4). That weighs it
-    # too heavily: only 4 of 16 dimensions of c stay in use. So it is divided by more.
+    # With the ELBO's divisor, 4, only 4 of 16 dimensions of c stayed in use. 64: tried by hand.
     "kl_c_divisor":        (64,    64,    1024),
-    # Raw cells run from 1 to 78, a move changes them by 1: the networks would first have to learn
-    # to subtract. Differences show the skill from the first update.
+    # Grid World's raw cells run from 1 to 78, a move changes them by 1: the networks would first
+    # have to learn to subtract. Differences show the skill from the first update.
     "relative":            (True,  True,  False),
-    "kl_warmup":           (0.0,   0.0,   0.0),
     # A Bi-LSTM of half the width has a quarter of the weights and 0.6 of the time of an update.
     "compact_lstm":        (True,  True,  False),
     # RAdam moves a parameter by about the learning rate per update at most: 1e-3 is too slow for a
@@ -133,9 +130,8 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     "log_var_start":       (-2.0,  -2.0,  None),
     "log_var_rate":        (10.0,  10.0,  1.0),
 }
-# Looked up by modality first; only if there is none, by environment. Replaces rows above.
+# Rows above are replaced by the modality's or, if it has none, the environment's: never by both.
 EXCEPTIONS = {
-    "gridworld": {"updates": (2_000, 2_750, 0)},
     # 160 zeros and ones say the same as 2 numbers, but it takes longer to learn what they mean.
     "onehot": {"updates": (2_000, 4_000, 0)},
     # Without these changes the model ignored z (how the ball was launched): the squared error, in
@@ -144,7 +140,7 @@ EXCEPTIONS = {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
         "batch_observations":  (8,     8,     1024),
-        "kl_c_divisor":        (1024,  1024,  1024),    # the published weight: all observations
+        "kl_c_divisor":        (1024,  1024,  1024),    # as if an update had Table 4's 1,024
         "kl_warmup":           (0.5,   0.5,   0.0),
         "updates":             (1_250, 2_500, 0),
         "observations":        (128,   1024,  1024),    # quick: a minute of recording
@@ -159,8 +155,8 @@ EXCEPTIONS = {
         "kl_c_divisor":        (1024,  1024,  1024),    # as in CREATE
         "kl_warmup":           (0.5,   0.5,   0.0),
         "updates":             (1_000, 1_500, 0),
-        # Not the paper's. Without it c collapses to one or two dimensions: only .28 to .84 of the
-        # held-out shapes, by recipe and seed, lie next to one of their class (`probe`), not .91.
+        # Not the paper's. Without it c collapses to one or two dimensions: nn_class (see probe)
+        # is 0.91 with it and 0.28 to 0.84 without it, by recipe and seed.
         "linear_path":         (True,  True,  False),
     },
 }
@@ -194,7 +190,7 @@ def load_environment(name: str):
     path = Path(name).resolve()
     if path.suffix != ".py" or not path.is_file():
         raise UserError(f"unknown environment {name!r}; allowed: {', '.join(ENVIRONMENTS)}, *.py")
-    # In the folders of sys.path Python, and the processes that it starts, look for modules.
+    # Worker processes must be able to import this file by its name, so its folder goes on sys.path.
     if path.stem not in sys.modules:
         sys.path.insert(0, str(path.parent))
     module = importlib.import_module(path.stem)
@@ -240,8 +236,8 @@ def prepare(raw, args):
     later = raw[:, 1:]  # (B, T, F)
     moves = raw.diff(dim=1)  # (B, T, F)
     if args.modality == "onehot":
-        # Class 40 of a relative state is "no change", 41 is one cell to the right or down. The
-        # input has 80 zeros and ones for x and for y, the target one class number for each.
+        # Relative class 40 is "no change", 41 one cell right or down; a first state keeps its cell.
+        # The input has 80 zeros and ones for x and for y, the target one class number for each.
         if args.relative:
             raw = torch.cat([first, moves + CLASSES // 2], 1)
             later = later - first + CLASSES // 2
@@ -249,7 +245,10 @@ def prepare(raw, args):
         return one_hot.flatten(2).float(), later.long()
     if not args.relative:
         return raw, later
-    units = getattr(load_environment(args.env), "UNITS", UNITS)
+    # UNITS: first states become (x - centre) / half_width, moves move / step. `step` should be such
+    # that two actions differ by more than 0.135 steps: the decoder's log-variance is clamped at -4
+    # (see forward), so its sigma is at least exp(-4 / 2) = 0.135.
+    units = getattr(load_environment(args.env), "UNITS", dict(centre=0, half_width=1, step=1))
     start = (first - units["centre"]) / units["half_width"]
     return torch.cat([start, moves / units["step"]], 1), (later - first) / units["step"]
 
@@ -286,13 +285,13 @@ class SumReLU(nn.Module):
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
-    # D.3.1 says only "1D batch-norm"; [code] this, also epsilon and momentum. A norm per dimension
-    # would scale a dimension of c or z that is not used up to variance 1: none could fall silent.
+    # D.3.1: "1D batch-norm"; [code] this, also epsilon and momentum. A norm per dimension would
+    # stretch even an unused one of c or z to variance 1; then none could go to the prior (KL 0).
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
     def forward(self, x):
-        return super().forward(x.reshape(-1, 1)).reshape(x.shape)  # as (B * C, 1)
+        return super().forward(x.reshape(-1, 1)).reshape(x.shape)  # all numbers in one column
 
 
 def normal(mean, log_var):
@@ -307,7 +306,7 @@ def initialise(module):
         nn.init.zeros_(module.bias)
 
 
-# By the side of a picture. Of videos it is 84 in B, 48 in A.3, D.3.1 and [code].
+# Keys: height = width of a picture. Of videos it is 84 in B, 48 in A.3, D.3.1 and [code].
 ENCODER_LAYERS = {48: 7, 84: 9}
 ENCODER_CHANNELS = (8, 8, 16, 16, 16, 16, 32, 32, 32)  # [code] after each layer
 DECODER_SIDES = {48: (6, 12, 24, 48), 84: (6, 11, 21, 42, 84)}  # [code] after each stage
@@ -328,7 +327,7 @@ def conv_encoder(side):
 
 
 class TrajectoryEncoder(nn.Module):
-    """Bi-LSTM Encoder: sequences (B, L, F) -> (B, H), 2 layers, averaged over time."""
+    """Bi-LSTM Encoder: sequences (B, L, F) -> (B, H), 2 layers, averaged over time [code]."""
 
     # appendix: to a 64-dimensional vector; [code] 64 per direction, directions averaged; [here] as
     # the code, or `compact`: 32 per direction, concatenated, which makes 64, too.
@@ -340,31 +339,31 @@ class TrajectoryEncoder(nn.Module):
 
     def forward(self, x):
         h = self.lstm(x)[0].mean(1)  # (B, 2 * width): forward half, backward half
-        return h.unflatten(1, (-1, self.hidden)).mean(1)  # (B, 1 or 2, H) -> (B, H)
+        return h.unflatten(1, (-1, self.hidden)).mean(1)  # (B, 2, H), compact (B, 1, H)
 
 
 class ActionInference(nn.Module):
-    """Action Inference Network: encoded observations (A, n, H) -> q(c | X), Gaussian (A, C)."""
+    """Action Inference Network: encoded observations (A, n, E) -> q(c | X), Gaussian (A, C)."""
 
-    def __init__(self, hidden, width, size):
+    def __init__(self, inputs, hidden, size):
         super().__init__()
         self.before = nn.Sequential(  # 4 linear layers, on each observation
-            nn.Linear(hidden, width), nn.ReLU(), Residual(width, 2), nn.Linear(width, width)
+            nn.Linear(inputs, hidden), nn.ReLU(), Residual(hidden, 2), nn.Linear(hidden, hidden)
         )
         # appendix: 3 layers; [code] 4 (a block of 3 and the output); [here] as the code.
-        self.after = nn.Sequential(Residual(width, 3), nn.Linear(width, 2 * size))
+        self.after = nn.Sequential(Residual(hidden, 3), nn.Linear(hidden, 2 * size))
         self.norm = GlobalBatchNorm()  # [code] over mean and log-variance together
 
     def forward(self, h):
         # The mean over a set does not depend on the order of its observations, or on their number.
-        pooled = self.before(h).mean(1)  # (A, n, width) -> (A, width)
+        pooled = self.before(h).mean(1)  # (A, n, H) -> (A, H)
         return normal(*self.norm(self.after(pooled)).chunk(2, -1))  # (A, 2C) -> twice (A, C)
 
 
 class ObservationInference(nn.Module):
-    """Observation Inference Network: encoded x (B, H), c (B, C) -> q(z | x, c), Gaussian (B, Z)."""
+    """Observation Inference Network: encoded x (B, E), c (B, C) -> q(z | x, c), Gaussian (B, Z)."""
 
-    # p(z | c): the same network without x. The VAE's q(z | x): without c.
+    # [code] The batch norm; p(z | c), the same network without x; the VAE's q(z | x), without c.
     def __init__(self, inputs, hidden, size):
         super().__init__()
         self.sum = SumReLU(inputs, hidden)
@@ -383,15 +382,15 @@ class ObservationInference(nn.Module):
 class ObservationDecoder(nn.Module):
     """Observation Decoder: first state (B, F), latents -> (B, T, F), the means of later states."""
 
-    # Of one-hot states it gives the logits, of a picture, which has no steps, (B, 1, F).
+    # F: 160 logits of a one-hot state, 288 features of a frame; a picture has no steps: (B, 1, F).
     def __init__(self, latents, features, hidden, steps):
         super().__init__()
         self.steps = steps
         self.sum = SumReLU(latents, hidden)
         if steps:
-            self.start = nn.Sequential(nn.Linear(features, hidden), Residual(hidden, 2))
+            self.start = nn.Sequential(nn.Linear(features, hidden), Residual(hidden, 2))  # 3 layers
             self.lstm = nn.LSTM(hidden, hidden, batch_first=True)
-        self.output = nn.Sequential(Residual(hidden, 2), nn.Linear(hidden, features))
+        self.output = nn.Sequential(Residual(hidden, 2), nn.Linear(hidden, features))  # 3 layers
 
     def forward(self, start, *latents):
         effect = self.sum(*latents)  # (B, H)
@@ -407,8 +406,8 @@ class ObservationDecoder(nn.Module):
 
 def conv_decoder(side, mask):
     """Convolutional Decoder: features (B, 288) -> greys (B, 1, S, S), with a mask (B, 2, S, S)."""
-    # A stage is a 3x3 and a transposed convolution that doubles the picture, each with batch norm
-    # and ReLU. The last layer is a 1x1 convolution; all comes out in [0, 1].
+    # A stage is a 3x3 convolution, then a transposed one that doubles the picture, both with batch
+    # norm and ReLU. The last layer is a 1x1 convolution; the sigmoid brings all into [0, 1].
     layers = [nn.Unflatten(1, (32, 3, 3))]
     before = 32
     for size in DECODER_SIDES[side]:
@@ -421,8 +420,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # [here] The picture starts white, as most of a video is. A grey one would be worse than the
-        # first frame everywhere, so the mask would fall to 0, where no picture learns (see decode).
+        # Channel 0 is the picture, 1 the mask. If the picture starts worse than the first frame,
+        # the mask goes to 0 and no gradient is left. [here] So it starts white: sigmoid(3) = 0.95.
         nn.init.constant_(last.bias[:1], 3.0)
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -431,7 +430,7 @@ def conv_decoder(side, mask):
 
 
 class ObservationModel(nn.Module):
-    """Encoder, decoder and likelihood of observations. Subclasses define `q` and `infer`."""
+    """Encoder, decoder and likelihood of observations. Subclasses: `q`, `infer`, `represent`."""
 
     def __init__(self, args, shape, latents):
         # shape: of one raw observation, (L, F), (L, S, S) or (S, S). latents: their sizes.
@@ -439,7 +438,7 @@ class ObservationModel(nn.Module):
         self.args = args
         features = shape[-1]  # F
         steps = shape[0] - 1  # T
-        sigmas = features  # the decoder has one log-variance for each number, or for each pixel
+        sigmas = features  # the decoder's log-variances: one per number or pixel, for all T steps
         if args.modality == "onehot":
             features = CLASSES * shape[-1]
         if args.modality in VISUAL:
@@ -449,7 +448,7 @@ class ObservationModel(nn.Module):
             self.conv_decoder = conv_decoder(shape[-1], args.modality == "video")
             self.to(memory_format=torch.channels_last)  # [here] 1.4 times as fast on a CPU
         if args.modality == "image":
-            # appendix: Bi-LSTM of trajectories only; [code] of all; [here] as the appendix.
+            # appendix: Bi-LSTM for trajectories only; [code] pictures, too; [here] as the appendix.
             steps = 0
             self.sequence = nn.Sequential(nn.Flatten(), nn.Linear(features, args.hidden), nn.ReLU())
         else:
@@ -461,36 +460,33 @@ class ObservationModel(nn.Module):
                 nn.init.constant_(self.log_var, args.log_var_start)
         # What the inference networks read: the encoded observation and, with --linear-path, the
         # inputs of the Bi-LSTM (or, of a picture, the features after the convolutions).
-        self.width = args.hidden
+        self.encoded_size = args.hidden  # E
         self.path = None
         if args.linear_path:
-            self.width += features * (steps + 1)
-            self.path = nn.Linear(self.width, args.representation_size)
+            self.encoded_size += features * (steps + 1)
+            self.path = nn.Linear(self.encoded_size, args.representation_size)
 
     def encode(self, x):
-        # Inputs of `prepare` -> states or features (B, L, F), encoded observations (B, H).
+        # Inputs of `prepare` -> start (B, F), for the decoder; encoded observations (B, E).
         if self.args.modality in VISUAL:
             features = self.conv(x.flatten(0, 1))  # (B * L, 1, S, S) -> (B * L, 288)
             x = features.unflatten(0, x.shape[:2])  # (B, L, 288)
         h = self.sequence(x)
         if self.path:
             h = torch.cat([h, x.flatten(1)], 1)
-        return x, h
+        return x[:, 0], h
 
     def add_linear_path(self, q, h):
-        # [here] mean = linear map + 0.1 * network. A network can memorise where each training
-        # action goes; a linear map cannot, so it carries over to unseen actions.
+        # [here] The mean of c (VAE: of z) = Linear(h, averaged over the set) + 0.1 * q.mean. Below
+        # h the Bi-LSTM or convolutions are learned as usual; but the part on top is linear: it
+        # cannot fit each training action by itself. 0.1: tried by hand.
         if self.path:
             q = Normal(self.path(h) + 0.1 * q.mean, q.stddev, validate_args=False)
         return q
 
-    def represent(self, h):
-        # Encoded observations (A, N, H) -> representations (A, C): means of c, or of z, averaged.
-        mean = self.q(h).mean  # HVAE: (A, C); VAE: (A, N, C)
-        return mean.view(len(h), -1, mean.shape[-1]).mean(1)  # (A, 1 or N, C) -> (A, C)
-
     def decode(self, start, frame, *latents):
-        # First states, first frames (of videos), latents -> means, or logits, of what follows.
+        # start: what the decoder conditions on; frame: the first picture itself, used only by the
+        # skip connection of videos. Returns means, or logits, of what follows.
         features = self.decoder(start, *latents)  # (B, T, F), or (B, 1, 288) for a picture
         if self.args.modality == "onehot":
             return features.unflatten(-1, (-1, CLASSES))  # (B, T, 160) -> (B, T, 2, 80)
@@ -502,23 +498,24 @@ class ObservationModel(nn.Module):
         if self.args.modality == "image":
             return picture
         # Temporal skip connection: where the mask is 0, the first frame shows through. appendix:
-        # mask * picture + frame; [code] as below; [here] as the code: a sum can exceed a pixel.
+        # mask * picture + frame; [code] as below; [here] as the code: a sum can leave the greys.
         mask = pixels[:, :, 1:]
         return mask * picture + (1 - mask) * frame
 
     def forward(self, raw):
-        # Raw observations (A, n, ...) -> the three terms of the ELBO, each per observation.
+        # Raw observations (A, n, ...) -> the three terms of the objective, each per observation.
+        # In order: encode every observation; draw one c for a set and repeat it for its n
+        # observations; draw a z for each (`infer`; the VAE has no c); decode; compute the terms.
         x, target = prepare(raw.flatten(0, 1), self.args)  # (B, ...), B = A * n
-        states, h = self.encode(x)
+        start, h = self.encode(x)
         latents, kl_z, kl_c = self.infer(h.unflatten(0, raw.shape[:2]))
-        output = self.decode(states[:, 0], x[:, :1], *latents)
+        output = self.decode(start, x[:, :1], *latents)
         if self.args.modality == "onehot":
             likelihood = Categorical(logits=output, validate_args=False)
         else:
             likelihood = normal(output, self.log_var.clamp(-4.0, 3.0))  # [code] the clamp
-        # Sums over all that belongs to one observation, then means over observations. One c serves
-        # a set, so its KL is divided (see HYPERPARAMETERS). [code] also has rec * w and KL / w with
-        # w = 1 + 0.5^epoch; [here] left out, because w is 1 after a few epochs.
+        # Sums over all that belongs to one observation, then means over observations. [code] also
+        # has rec * w and KL / w, w = 1 + 0.5^epoch; [here] left out: w is 1 after a few epochs.
         rec = likelihood.log_prob(target).flatten(1).sum(1).mean()
         kl_z = kl_z.sum(-1).mean()
         kl_c = kl_c.sum(-1).mean() / self.args.kl_c_divisor
@@ -531,19 +528,21 @@ class HVAE(ObservationModel):
     def __init__(self, args, shape):
         size = args.representation_size
         super().__init__(args, shape, latents=(size, size))
-        self.q_c = ActionInference(self.width, args.q_hidden, size)
-        self.q_z = ObservationInference((self.width, size), args.hidden, size)
+        self.q_c = ActionInference(self.encoded_size, args.q_hidden, size)
+        self.q_z = ObservationInference((self.encoded_size, size), args.hidden, size)
         self.p_z = ObservationInference((size,), args.hidden, size)
         self.apply(initialise)
 
-    def q(self, h):  # q(c | X): encoded observations (A, N, H) -> Gaussian of c, (A, C)
+    def q(self, h):  # q(c | X): encoded observations (A, N, E) -> Gaussian of c, (A, C)
         return self.add_linear_path(self.q_c(h), h.mean(1))
 
+    def represent(self, h):  # (A, N, E) -> representations (A, C)
+        return self.q(h).mean
+
     def infer(self, h):
-        # Encoded observations (A, n, H) -> latents (z, c), KL of z (B, Z), KL of c (A, C).
-        # One draw of c for a set, then one of z for each of its n observations.
+        # Encoded observations (A, n, E) -> latents (z, c), KL of z (B, Z), KL of c (A, C).
         q_c = self.q(h)
-        c = q_c.rsample().repeat_interleave(h.shape[1], 0)  # (A, C) -> (B, C)
+        c = q_c.rsample().repeat_interleave(h.shape[1], 0)  # one for a set: (A, C) -> (B, C)
         q_z = self.q_z(h.flatten(0, 1), c)
         kl_z = kl_divergence(q_z, self.p_z(c))
         kl_c = kl_divergence(q_c, Normal(0.0, 1.0))
@@ -558,14 +557,17 @@ class VAE(ObservationModel):
     def __init__(self, args, shape):
         size = args.representation_size
         super().__init__(args, shape, latents=(size,))
-        self.q_z = ObservationInference((self.width,), args.hidden, size)
+        self.q_z = ObservationInference((self.encoded_size,), args.hidden, size)
         self.apply(initialise)
 
-    def q(self, h):  # q(z | x): encoded observations (A, N, H) -> Gaussians of z, (A, N, Z)
+    def q(self, h):  # q(z | x): encoded observations (A, N, E) -> Gaussians of z, (A, N, Z)
         return self.add_linear_path(self.q_z(h), h)
 
+    def represent(self, h):  # (A, N, E) -> (A, N, Z) -> representations (A, Z)
+        return self.q(h).mean.mean(1)
+
     def infer(self, h):
-        # Encoded observations (A, n, H) -> latents (z,), KL of z (A, n, Z), and no KL of c.
+        # Encoded observations (A, n, E) -> latents (z,), KL of z (A, n, Z), and no KL of c.
         q_z = self.q(h)
         kl_z = kl_divergence(q_z, Normal(0.0, 1.0))
         return (q_z.rsample().flatten(0, 1),), kl_z, torch.zeros(1)
@@ -575,21 +577,27 @@ class VAE(ObservationModel):
 
 
 def write(path: Path, save) -> None:
-    """Call save(file) on a temporary file, then rename it: nobody ever reads half a file."""
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
+    """Write the file that save(file) makes: all of it or, if something fails, nothing."""
+    memory = io.BytesIO()
+    save(memory)
+    write_pieces(path, [memory.getvalue()])
+
+
+def write_pieces(path, pieces):
+    # They go to a temporary file, which is renamed in the end: nobody ever reads half a file.
+    temporary = path.with_name(f".{os.urandom(8).hex()}-{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with open(temporary, "wb") as file:
-                save(file)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except (OSError, RuntimeError) as error:
-        # torch.save makes a RuntimeError of an OSError; any other one keeps its traceback.
-        if isinstance(error, RuntimeError) and not isinstance(error.__context__, OSError):
-            raise
-        raise UserError(f"cannot write {path} (is the disk full?): {error}") from error
+        for piece in pieces:  # an error in making a piece keeps its traceback
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with open(temporary, "ab") as file:
+                    file.write(piece)
+            except OSError as error:
+                raise UserError(f"cannot write {path} (is the disk full?): {error}") from error
+        temporary.replace(path)
+    finally:
+        if os.path.exists(temporary):
+            temporary.unlink()
 
 
 def short_hash(data):
@@ -597,7 +605,7 @@ def short_hash(data):
 
 
 def source_hash(module):
-    # Whoever changes an environment's physics changes what is recorded.
+    # Has the file changed in any way? Then recordings are made anew; of a table there is a note.
     return short_hash(Path(module.__file__).read_bytes())
 
 
@@ -609,31 +617,31 @@ def observe(module, ids, args):
     path = Path(args.runs_dir) / "observations" / f"{kind}-{source}-{short_hash(ids.tolist())}.npy"
     workers = os.cpu_count() or 1
 
-    def record(file):
+    def pieces():
         # All pictures do not fit in memory: first the header of a .npy file, then 128 actions at a
         # time. Always seed 0: encoders differ by their seed, not by their data.
         for i in tqdm(range(0, len(ids), 128), "recording", disable=None):
-            try:
-                data = module.action_observations(ids[i : i + 128], N, args.modality, 0, workers)
-            except OSError as error:  # `write` would take it for a full disk
-                raise ValueError("action_observations failed") from error
+            data = module.action_observations(ids[i : i + 128], N, args.modality, 0, workers)
             if i == 0:
                 shape = (len(ids), *data.shape[1:])
-                header = dict(descr=data.dtype.str, fortran_order=False, shape=shape)
-                np.lib.format.write_array_header_1_0(file, header)
-            file.write(data.tobytes())
+                header = io.BytesIO()
+                description = dict(descr=data.dtype.str, fortran_order=False, shape=shape)
+                np.lib.format.write_array_header_1_0(header, description)
+                yield header.getvalue()
+            yield data.tobytes()
 
     print(f"recordings: {path} (delete it to record anew)", flush=True)
     if not path.exists():
         for old in path.parent.glob(f"{kind}-*.npy"):
             if source not in old.name:  # by another version of the environment's file
                 old.unlink(missing_ok=True)  # another process may have deleted it just now
-        write(path, record)
+        write_pieces(path, pieces())
     return np.load(path, mmap_mode="r")  # only what is used is in memory (810 shapes: 5.9 GB)
 
 
 def fit(model, data, rows, args):
     # Maximise the objective on data[rows]; return the losses of every update, a list of dicts.
+    # Log-variances that are parameters, by their name, have a learning rate of their own.
     groups = []
     for name, parameter in model.named_parameters():
         factor = args.log_var_rate if name.endswith("log_var") else 1.0
@@ -655,8 +663,8 @@ def fit(model, data, rows, args):
         # Of each action n different observations: the positions of the n smallest random numbers.
         picks = rng.random((batch, data.shape[1])).argpartition(n - 1)[:, :n]  # (A, n)
         parts = model(torch.from_numpy(data[actions, picks]).to(args.device))  # (A, n, ...)
-        # Minus the ELBO. In a warm-up the KLs weigh less: latents are used before they cost much.
-        kl_weight = min(1.0, update / (args.kl_warmup * updates + 1))  # kl_warmup 0: 1
+        # Minus the objective. A warm-up of the KLs: latents are used before they cost much.
+        kl_weight = min(1.0, update / (args.kl_warmup * updates + 1))  # climbs to 1; kl_warmup 0: 1
         parts["loss"] = kl_weight * (parts["kl_z"] + parts["kl_c"]) - parts["rec"]
         optimizer.zero_grad()
         parts["loss"].backward()
@@ -672,20 +680,17 @@ def fit(model, data, rows, args):
 def embed(model, data, ids, args):
     # The table (NUM_ACTIONS, C): each action's representation, from all of its observations.
     model.eval()  # running statistics: a representation does not depend on its neighbours
-    shape = load_environment(args.env).NUM_ACTIONS, args.representation_size
-    table = np.zeros(shape, np.float32)
+    table = np.zeros((load_environment(args.env).NUM_ACTIONS, args.representation_size), np.float32)
     for action, raw in zip(tqdm(ids, "encoding", disable=None), data, strict=True):
-        x, _ = prepare(torch.tensor(raw, device=args.device), args)  # (n, ...)
-        _, h = model.encode(x)  # (n, H)
+        x, _ = prepare(torch.tensor(raw, device=args.device), args)  # (N, ...)
+        _, h = model.encode(x)  # (N, E)
         table[action] = model.represent(h[None])[0].cpu()
     return table
 
 
 def train(args: Args) -> Path:
-    """Train an encoder, write its table; return its path, `representation_path(args)`.
-
-    Beside it: .pt (weights), .csv (losses), .json (scores of `probe`), -tsne.png. Or UserError.
-    """
+    """Train an encoder, write its table; return its path, `representation_path(args)`."""
+    # Beside it: .pt (weights), .csv (losses), .json (scores of `probe`), -tsne.png. Or UserError.
     module = load_environment(args.env)
     choose("split", args.split, getattr(module, "SPLITS", ("default",)))
     if args.batch_observations > args.observations:
@@ -736,25 +741,23 @@ def check_table(path, mean, module):
     # UserError unless a table has a row of finite numbers for every action.
     number = module.NUM_ACTIONS
     if mean.ndim != 2 or len(mean) != number or not np.isfinite(mean).all():
-        raise UserError(
-            f"{path}: mean must be finite (training diverged?) and ({number}, D), got {mean.shape}"
-        )
+        wanted = f"finite (training diverged?) and ({number}, D)"
+        raise UserError(f"{path}: mean must be {wanted}, got {mean.shape}")
 
 
 def action_set(module):
-    # A hash of labels and engineered representations, in thousandths: last bits vary by machine.
+    # Do row numbers still mean the same actions? A hash of labels and engineered representations;
+    # these are rounded to 3 decimals, because last bits vary by machine.
     features = np.round(module.engineered_representations(), 3) + 0.0  # -0.0 becomes 0.0
     return short_hash([*map(str, module.action_labels()), features.tolist()])
 
 
 def save_representation(path, mean, action_ids, config: dict) -> Path:
-    """Write a table that `load_representation` accepts, whoever made it; return its path.
-
-    mean: (NUM_ACTIONS, D), finite. action_ids: what the encoder was trained on, or []. config: for
-    JSON, with "env"; "split" and "split_seed" are checked at loading. UserError if it is wrong.
-    """
+    """Write a table that `load_representation` accepts, whoever made it; return its path."""
+    # mean: (NUM_ACTIONS, D), finite. action_ids: those the encoder was trained on, or []. config:
+    # for JSON, with "env"; "split", "split_seed" are checked at loading. UserError if it is wrong.
     path = Path(path)
-    module = load_environment(str(config.get("env")))
+    module = load_environment(str(config.get("env")))  # without one: unknown environment 'None'
     mean = np.asarray(mean, np.float32)
     check_table(path, mean, module)
     config = config | dict(action_set=action_set(module), source=source_hash(module))
@@ -764,10 +767,8 @@ def save_representation(path, mean, action_ids, config: dict) -> Path:
 
 
 def load_representation(path, env: str, split: str = "default", split_seed: int = 0) -> dict:
-    """Read a table; make sure that it belongs to this environment, action set and split.
-
-    Returns mean (NUM_ACTIONS, D) float32, action_ids int64, and config, a dict; else UserError.
-    """
+    """Read a table; make sure that it belongs to this environment, action set and split."""
+    # Returns mean (NUM_ACTIONS, D) float32, action_ids int64, and config, a dict; else UserError.
     module = load_environment(env)
     try:
         with np.load(path) as file:
@@ -778,9 +779,8 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
     except Exception as error:  # archives, arrays and JSON each have errors of their own
         raise UserError(f"{path} is missing or no file of representations") from error
     # A table of your own that names no split belongs to every split.
-    wanted = dict(
-        env=environment_name(env), action_set=action_set(module), split=split, split_seed=split_seed
-    )
+    actions = dict(env=environment_name(env), action_set=action_set(module))
+    wanted = actions | dict(split=split, split_seed=split_seed)
     for key, value in wanted.items():
         if config.get(key, value) != value:
             raise UserError(f"{path} has {key} {config[key]!r}, wanted {value!r}: make it again")
@@ -791,7 +791,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
 
 
 def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
-    """What a table tells: read-outs fitted on training actions, scored on held-out ones."""
+    """How well simple models, fitted on training actions, read known facts off held-out rows."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
     from sklearn.pipeline import make_pipeline
@@ -803,9 +803,9 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     module = load_environment(env)
     features = np.asarray(module.engineered_representations())
     ridge = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-4, 4, 17)))
-    # Of Grid World's skills: a linear read-out of the net displacement; logistic read-outs of the
-    # five moves, by chance 0.25; the share whose nearest training skill has the same displacement.
-    # The authors' tables, released with [code], score, in this order, 0.946, 0.604, 0.717 (HVAE);
+    # Of Grid World's skills: a linear read-out of the net displacement; logistic ones of the five
+    # moves, by chance 0.25; the share whose nearest training skill has the same displacement.
+    # The authors' tables, released with [code], in this order: 0.946, 0.604, 0.717 (HVAE);
     # 0.970, 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
     scores = {}
     if environment_name(env) == "gridworld":
@@ -820,16 +820,15 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     others = NearestNeighbors(n_neighbors=1).fit(mean[held_out_ids])
     nearest = others.kneighbors(return_distance=False)[:, 0]
     scores["nn_class"] = np.mean(labels[nearest] == labels)
-    # A linear read-out of those engineered features that differ among the actions.
     varies = (features[train_ids].std(0) > 1e-6) & (features[held_out_ids].std(0) > 1e-6)
-    if varies.any():
+    if varies.any():  # a linear read-out of the features that differ among actions
         scores["engineered_r2"] = score(ridge, features[:, varies])
     return {key: round(float(value), 4) for key, value in scores.items()}
 
 
 def report(path, table, split, args):
     # Scores on the held-out actions: one line, <name>.json, and the t-SNE picture.
-    held_out = np.concatenate([split["valid"], split["test"]]).astype(int)
+    held_out = np.concatenate([split["valid"], split["test"]]).astype(int)  # the oracle saw them
     if len(held_out) < 3:
         print("fewer than 3 held-out actions: no scores, no picture")
         return
@@ -860,7 +859,8 @@ def plot_tsne(mean, labels, path):
 
 def parse_args(words: list[str]) -> Args:
     """Args of a command line; --help shows the numbers of *its* environment and recipe."""
-    # Three words decide the defaults, so it is read twice. "" stands for the first modality.
+    # First pass: only to learn env, recipe and modality (Grid World's numbers are fillers; modality
+    # "" = not given). Second pass: the whole line, with the right defaults.
     first = replace(default_args("gridworld"), modality="")
     first = tyro.cli(Args, args=[w for w in words if w not in ("-h", "--help")], default=first)
     default = default_args(first.env, first.recipe, first.modality)

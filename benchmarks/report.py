@@ -298,7 +298,7 @@ def draw_engineered() -> None:
     held_out = np.concatenate(held_out)
     moves = module.engineered_representations("5d")[held_out]
     path = RESULTS / "fig4-tsne-engineered.png"
-    hvae.plot_tsne(moves, module.action_labels()[held_out], path, "gridworld-engineered-5d")
+    hvae.plot_tsne(moves, module.action_labels()[held_out], path)
 
 
 # ---- the pages ----

@@ -1,5 +1,6 @@
 """The HVAE against torch's distributions, the published layer sizes, and wrong files."""
 
+import io
 import json
 import os
 import subprocess
@@ -51,13 +52,13 @@ def test_loss_equals_the_elbo_written_observation_by_observation(modality, monke
     parts, rec, kl_z, kl_c = model(raw), 0.0, 0.0, 0.0
     for observations in raw:
         inputs, targets = hvae.prepare(observations, model.args)
-        states, h = model.encode(inputs)
+        start, h = model.encode(inputs)
         q_c = model.q_c(h[None])
         kl_c += kl_divergence(q_c, Normal(torch.zeros(16), torch.ones(16))).sum()
         for j in range(2):
             q_z, target = model.q_z(h[j : j + 1], q_c.mean), targets[j : j + 1]
             kl_z += kl_divergence(q_z, model.p_z(q_c.mean)).sum()
-            output = model.decode(states[j : j + 1, 0], None, q_z.mean, q_c.mean)
+            output = model.decode(start[j : j + 1], None, q_z.mean, q_c.mean)
             p_x = Categorical(logits=output)
             if modality != "onehot":
                 p_x = Normal(output, (model.log_var.clamp(-4, 3) / 2).exp())
@@ -89,7 +90,7 @@ def test_number_of_parameters_is_the_published_one(modality, shape, changes, hie
 def test_shut_mask_shows_the_first_frame_and_open_mask_the_picture():
     model, raw = small("video")
     x, target = hvae.prepare(raw.flatten(0, 1), model.args)
-    inputs = model.encode(x)[0][:, 0], x[:, :1], torch.randn(6, 16), torch.randn(6, 16)
+    inputs = model.encode(x)[0], x[:, :1], torch.randn(6, 16), torch.randn(6, 16)
     last = model.conv_decoder[-2].requires_grad_(False)  # the 1x1 convolution
     last.weight.zero_()
     last.bias[:] = torch.tensor([50, -50])  # picture, mask
@@ -120,7 +121,8 @@ def test_batch_norm_is_global_and_the_linear_path_a_map_of_averaged_observations
     torch.testing.assert_close(hvae.GlobalBatchNorm()(x), expected, rtol=1e-4, atol=1e-5)
     for kind in (HVAE, VAE):
         model, raw = small("xy", kind, linear_path=True)
-        x, h = model.eval().encode(hvae.prepare(raw.flatten(0, 1), model.args)[0])
+        x, _ = hvae.prepare(raw.flatten(0, 1), model.args)
+        _, h = model.eval().encode(x)
         assert torch.equal(h[:, 64:], x.flatten(1))
         h, path = h.unflatten(0, (3, 2)), model.path
         both, model.path = model.represent(h), None
@@ -218,7 +220,7 @@ def test_no_op_is_an_action_and_recordings_are_made_once_per_source(tmp_path, mo
     assert table["mean"][ids].any(1).all() and not table["mean"][12:].any()
     hvae.observe(create_env, ids[:5], args)  # of another split
     again = hvae.observe(create_env, ids, replace(args, seed=3))  # of a second encoder
-    assert list(map(len, calls)) == [12, 5] and np.array_equal(again, record(ids, 4, "xy", 0, 1))
+    assert list(map(len, calls)) == [12, 5] and np.array_equal(again, record(ids, 4, "state", 0, 1))
     (tmp_path / "create_env.py").write_text("# other physics", encoding="utf-8")
     monkeypatch.setattr(create_env, "__file__", str(tmp_path / "create_env.py"))
     hvae.observe(create_env, ids, args)
@@ -292,10 +294,10 @@ def test_missing_package_is_one_sentence_an_environments_error_is_not(tmp_path, 
         raise error
 
     monkeypatch.setattr(gridworld, "action_observations", fail)
-    for error in ValueError("slip"), RuntimeError("slip"), OSError("not a full disk"):  # noqa: B007
-        with pytest.raises((ValueError, RuntimeError), match="^slip|^action_observations failed"):
+    for error in ValueError("slip"), RuntimeError("slip"), OSError("slip"):
+        with pytest.raises(type(error), match="^slip$"):
             hvae.train(tiny(runs_dir=str(tmp_path)))
-    assert not list((tmp_path / "observations").iterdir())
+    assert not list(tmp_path.iterdir())
     error = ModuleNotFoundError("Shape Stacking needs pybullet")
     monkeypatch.setattr(hvae.importlib, "import_module", fail)
     refused("^Shape Stacking needs pybullet$", hvae.load_environment, "stacking")
@@ -366,16 +368,22 @@ def test_wrong_or_damaged_tables_are_refused(tmp_path):
     refused("missing", load, tmp_path / "no.npz", "gridworld")
 
 
-def test_file_that_cannot_be_written_is_one_sentence_and_leaves_nothing(tmp_path):
-    class Full:  # torch.save makes a RuntimeError of its OSError
+def test_file_that_cannot_be_written_is_one_sentence_and_leaves_nothing(tmp_path, monkeypatch):
+    class Full(io.BytesIO):
         def write(self, data):
             raise OSError("no space left")
 
+    def pieces():
+        yield b"half"
+        raise OSError("not the disk's")
+
     (tmp_path / "file").touch()
     words, path = "cannot write .*table.npz .is the disk full", tmp_path / "table.npz"
-    refused(words, hvae.write, path, lambda file: file.write(b"half") and Full().write(b""))
-    refused(words, hvae.write, path, lambda file: torch.save(torch.ones(9), Full()))
+    with pytest.raises(OSError, match="^not the disk's$"):
+        hvae.write_pieces(path, pieces())
     refused(words, hvae.write, tmp_path / "file" / "table.npz", lambda file: None)
+    monkeypatch.setattr(hvae, "open", lambda *args: Full(), raising=False)
+    refused(words, hvae.write, path, lambda file: torch.save(torch.ones(9), file))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
