@@ -286,7 +286,7 @@ class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
     # D.3.1: "1D batch-norm"; [code] this, also epsilon and momentum. A norm per dimension would
-    # stretch even an unused one of c or z to variance 1; then none could go to the prior (KL 0).
+    # stretch an unused dimension of c to variance 1; beside the others it can stay near 0 (KL 0).
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
@@ -420,9 +420,9 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0 is the picture, 1 the mask. If the picture starts worse than the first frame,
-        # the mask goes to 0 and no gradient is left. [here] So it starts white: sigmoid(3) = 0.95.
-        nn.init.constant_(last.bias[:1], 3.0)
+        # Channel 0 is the picture, 1 its mask (see decode). A grey picture is everywhere worse than
+        # the first frame, dark on white: the mask would go to 0. [here] So it starts at .95, white.
+        nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
 
@@ -436,6 +436,7 @@ class ObservationModel(nn.Module):
         # shape: of one raw observation, (L, F), (L, S, S) or (S, S). latents: their sizes.
         super().__init__()
         self.args = args
+        # Of trajectories; other modalities correct them below.
         features = shape[-1]  # F
         steps = shape[0] - 1  # T
         sigmas = features  # the decoder's log-variances: one per number or pixel, for all T steps
@@ -477,9 +478,9 @@ class ObservationModel(nn.Module):
         return x[:, 0], h
 
     def add_linear_path(self, q, h):
-        # [here] The mean of c (VAE: of z) = Linear(h, averaged over the set) + 0.1 * q.mean. Below
-        # h the Bi-LSTM or convolutions are learned as usual; but the part on top is linear: it
-        # cannot fit each training action by itself. 0.1: tried by hand.
+        # [here] The mean of c (VAE: of z) = Linear(h, averaged over the set) + 0.1 * q.mean. The
+        # deep part counts a tenth; the rest is a linear read-out of h, which cannot fit each
+        # training action by itself. That c does not collapse then was found by trying, 0.1, too.
         if self.path:
             q = Normal(self.path(h) + 0.1 * q.mean, q.stddev, validate_args=False)
         return q
@@ -699,11 +700,11 @@ def train(args: Args) -> Path:
         raise UserError("either updates or epochs must be above 0, and the other one 0")
     if args.compact_lstm and args.hidden % 2:
         raise UserError("compact_lstm halves hidden, which must be even")
-    # CREATE's no-op, always available, is in no part of a split, but an action like others (A.3).
     split = module.split_actions(args.split, args.split_seed)
     parts = np.concatenate(list(split.values())).astype(int)  # [] alone would be float
     if len(np.unique(parts)) < len(parts):
         raise UserError(f"the parts of split {args.split!r} overlap")
+    # CREATE's no-op, always available, is in no part of a split, but an action like others (A.3).
     no_op = getattr(module, "NO_OP", parts[:0])  # or none
     shown = parts if args.train_on == "all" else split["train"]
     action_pool = np.union1d(no_op, parts)
