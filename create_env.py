@@ -42,7 +42,7 @@ A tool class of your own is an entry of OWN_KINDS. Its tools get the ids after a
 
 Every split divides them 2:1:1 separately, so that no other tool changes its part; but
 `engineered_representations` gets a column more and other standardised numbers. What a class does to
-a ball is a contact rule (`make_space`). If one raises an exception, pymunk prints it and goes on.
+a ball is a contact rule (`make_space`). If a rule raises, pymunk prints the exception and goes on.
 """
 
 import io
@@ -160,7 +160,7 @@ RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# No squares at 45 degrees: [code] has these upright boxes as a class of its own, in no split.
+# Angles point to a corner: squares at 45 degrees lie flat, [code]'s class of boxes, in no split.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. Planks and ball tools have no friction: [code] forgets to set it.
@@ -186,7 +186,8 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    "No-op": Kind("disc", GREEN, GOAL),  # never drawn or placed; for the probe ball: NO_OP_RADIUS
+    # Never drawn or placed: a disc that gives the launches of the probe ball a moment of contact.
+    "No-op": Kind("disc", GREEN, GOAL),
     # The tools in the order of their ids, which saved representations and runs rely on. Down to the
     # bucket they are those of the Default Split.
     "Ramp": Kind("segment", ORANGE, turn=180, vary=RAMPS),
@@ -278,8 +279,8 @@ NUM_ACTIONS = len(TOOLS)  # 8,359 distinct tools over all splits
 # Arrays (NUM_ACTIONS,): the class; the angle in degrees (of see-saws the limit, 0 without angles).
 TOOL_KINDS = np.array([tool.kind for tool in TOOLS])
 TOOL_ANGLES = np.array([tool.max_angle or tool.angle for tool in TOOLS])
-# Is it one of the tools 15 degrees apart (limits 5, 20, ...), not one that the analyses add? All
-# angles are multiples of 3, so they never leave 5; all limits are 5 + 3k, so they never leave 0.
+# Is it one of the tools 15 degrees apart (limits 5, 20, ...), not one that the analyses add? Modulo
+# 15, angles are 0, 3, .. 12 and limits 2, 5, .. 14: only coarse angles are 0, coarse limits 5.
 IS_COARSE = np.isin(TOOL_ANGLES % COARSE_STEP, (0, FIRST_LIMIT))
 IS_COARSE |= np.isin(TOOL_KINDS, list(OWN_KINDS))
 
@@ -600,8 +601,7 @@ def to_units(norm):
 BOX_SIZE = {"Cannon": (10.0, 7.3), "Fan": (6.7, 10.0)}
 MUZZLE = (5.0, 3.65)  # [code] units: times (cos, sin) of the aim, where balls are shot from
 # [code] Funnels and buckets are open between their last corner and their first. At tool angle 0 a
-# funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees (right rim), a bucket's at 135 (left
-# rim), 225, 315 and 45 degrees (right rim).
+# funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees, a bucket's at 135, 225, 315 and 45.
 LAST_CORNER = {"Funnel": 30, "Bucket": 45}
 # [code] The probe ball touches the no-op when its centre is within 0.1 sqrt(8) norm, 11.9 units. A
 # disc smaller by the ball's radius is touched exactly then; as a GOAL it does nothing to the ball.
@@ -804,9 +804,10 @@ def make_space() -> pymunk.Space:
     space.gravity = GRAVITY
     space.sleep_time_threshold = SLEEP_TIME
     # begin: once per contact; pre_solve and post_solve: at every step of it, before and after
-    # pymunk computes the forces. Goals at every step, because `_judge` forgets the touch after each
-    # action; two balls once, because a marker's touch is kept and a goal ball's ends the episode.
-    # Planks after the forces, because they damp the speed that a ball has then.
+    # pymunk computes the forces. `_judge` forgets a goal's touch after each action; a target that
+    # lies on it is reported at every step. Of two balls the first touch is enough: a marker's is
+    # kept, and a goal is a ball only where there is no marker and a touch ends the episode. Planks
+    # come after the forces, because they damp the speed that a ball has then.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
@@ -1127,8 +1128,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. [code]: a touch before the hit counts at the hit. [here] none of an earlier
-        # action, because the task is to reach the goal by the hit; within one the order is free.
+        # Then the goal. [code]: a touch before the hit counts as soon as the hit comes. [here] those
+        # of earlier actions are forgotten, because the hit has to bring the target to the goal.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1246,9 +1247,8 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# For hvae.py: it models first states as (x - centre) / half_width and moves between states as
-# dx / step. It keeps its decoder's log-variance at -4 or more: a standard deviation of at least
-# exp(-4 / 2) = 0.135 steps, or 0.54 pixel, because [here] `step` is 4 pixels in norm.
+# For hvae.py, which sees a first state as (x - centre) / half_width, and later numbers, velocities
+# too, as differences / step. Its decoder is never surer than 0.135 steps: [here] half a pixel.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
