@@ -1128,7 +1128,7 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. [code]: a touch before the hit counts as soon as the hit comes. [here] those
+        # Then the goal. [code]: a touch before the hit counts once the hit comes. [here] those
         # of earlier actions are forgotten, because the hit has to bring the target to the goal.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
