@@ -803,12 +803,11 @@ def make_space() -> pymunk.Space:
     space = pymunk.Space()  # 10 solver iterations and no damping are pymunk's defaults
     space.gravity = GRAVITY
     space.sleep_time_threshold = SLEEP_TIME
-    # begin: once per contact; pre_solve and post_solve: at every step of it, before and after
-    # pymunk computes the forces. `_judge` forgets a goal's touch after each action; a target that
-    # lies on it is reported at every step. Of two balls the first touch is enough: a marker's is
-    # kept, and a goal is a ball only where there is no marker and a touch ends the episode. Planks
-    # come after the forces, because they damp the speed that a ball has then.
+    # begin: once per contact. pre_solve, post_solve: at every step, before and after the forces.
+    # A target that stays on a goal is noted every time, because `_judge` forgets it after an action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
+    # Of two balls once is enough: a marker's touch is never forgotten, and where the goal is a ball
+    # there is no marker, so that the first touch ends the episode.
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
     space.on_collision(MOVING, LADDER, pre_solve=_on_carrier)
@@ -816,7 +815,7 @@ def make_space() -> pymunk.Space:
     space.on_collision(MOVING, FAN, pre_solve=_on_fan)
     space.on_collision(MOVING, FUNNEL, pre_solve=_on_funnel)
     space.on_collision(MOVING, BUCKET, pre_solve=_on_bucket)
-    space.on_collision(MOVING, PLANK, post_solve=_on_plank)
+    space.on_collision(MOVING, PLANK, post_solve=_on_plank)  # damps the speed after the forces
     return space
 
 
@@ -1247,8 +1246,9 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# For hvae.py, which sees a first state as (x - centre) / half_width, and later numbers, velocities
-# too, as differences / step. Its decoder is never surer than 0.135 steps: [here] half a pixel.
+# The scale of the numbers for hvae.py. It reads the first state as (x - centre) / half_width, each
+# later one as (x - the one before) / step, velocities likewise. [here] step is 4 pixels: the least
+# deviation of its decoder, exp(-4 / 2) = 0.135 steps, is then about half a pixel.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1260,7 +1260,7 @@ def action_observations(action_ids, num_observations, modality="state", seed=0, 
     | "state"  | float32 (len(ids), n, 7, 6): tool x, y, ball x, y (norm), ball velocity (norm/s) |
     | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm)                                    |
     | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same scenes                 |
-    appendix: (x, y); [code] learned its tables from "state"; [here] as [code], they tell more.
+    appendix: (x, y); [code] learned its representations from "state"; [here] as [code].
     n = `num_observations` (paper: 1,024). Frames are 1/3 s apart, the contact in the middle where
     it can be. The bytes for one tool depend on (seed, tool, n) only, not on `workers` or other ids.
     "video" needs 16 MB per tool at n = 1,024. Raises ValueError for bad ids, modality or n.
