@@ -804,7 +804,7 @@ def make_space() -> pymunk.Space:
     space.gravity = GRAVITY
     space.sleep_time_threshold = SLEEP_TIME
     # begin: once per contact. pre_solve, post_solve: at every step, before and after the forces.
-    # A target that stays on a goal is noted every time, because `_judge` forgets it after an action.
+    # A target that stays on a goal is noted anew: `_judge` forgets the touch after each action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
     # Of two balls once is enough: a marker's touch is never forgotten, and where the goal is a ball
     # there is no marker, so that the first touch ends the episode.
