@@ -12,13 +12,10 @@ highest centre of mass (not top) when the agent stops or has acted ten times. At
                 .-.   .-.
     ____________|_|___|_|____________  table, z = 0        1 unit = 1 m, angles in radians
 
-Commands:
-
     python stacking_env.py                # two towers as GIFs, all families as a picture (10 s)
     python stacking_env.py --split full   # the same with Table 2's unseen classes
 
 Paper map (appendix -> here):
-
     A.4 Actions, the 810 shapes   FAMILIES, SHAPES; StackingEnv.step
     A.4 Action set split, Table 2 split_actions
     A.4 State                     photograph, StackingEnv._observe
@@ -376,8 +373,8 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     for k in rng.permutation(len(groups)):
         if len(valid) + len(groups[k]) <= len(unseen) // 2:
             valid += groups[k]
-    test = np.setdiff1d(unseen, valid)
-    return {"train": np.flatnonzero(train), "valid": np.sort(valid), "test": test}
+    parts = {"train": np.flatnonzero(train), "valid": np.sort(valid)}
+    return parts | {"test": np.setdiff1d(unseen, valid)}
 
 
 # ---- what Bullet simulates and draws ----
@@ -581,8 +578,7 @@ class StackingEnv(gym.Env):
         if PLACEMENTS[placement] > 0:
             parts["position"] = spaces.Box(-1, 1, (PLACEMENTS[placement],), np.float32)
         self.action_space = spaces.Dict(parts)
-        # The first reset makes the simulation: whoever only asks for the spaces needs none.
-        self._bullet = None
+        self._bullet = None  # the first reset makes the simulation; the spaces need none
         self._over = True  # nothing to step yet
         self._frames = []  # colour pictures of the last reset or step
 
@@ -646,12 +642,11 @@ class StackingEnv(gym.Env):
         shape_id = self.available[choice]
         placed = shape_id in self.shape_ids[2:]
         inside = (np.abs(position) <= 1).all()
-        drops = not stop and not placed and inside
 
         # Drop the shape and wait until the scene has settled. Coordinates that the agent does not
         # decide are 0, the centre of the table (C.6). [code] What still moves, because 300 steps
         # were not enough, is halted first; it makes no measurable difference.
-        if drops:
+        if inside and not placed and not stop:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
             place = np.zeros(2)  # x, y
@@ -876,7 +871,7 @@ FLAT = ("horizontal_rectangle", "half_rectangle", "cube", "arch", "rectangle", "
 def greedy_plan(available: Sequence[int]) -> list[int]:
     """Positions in `available` of at most ten shapes, in order, for a high tower.
 
-    The shapes with flat top and bottom, widest first, then the tallest of the rest. All over one
+    The shapes with flat top and bottom, largest first, then the tallest of the rest. All over one
     cylinder they reach a mean height of 5.1 to 5.4; random play reaches 1.5 to 1.6.
     """
 
