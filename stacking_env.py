@@ -599,10 +599,9 @@ class StackingEnv(gym.Env):
         if self.num_available < len(self.action_pool):
             self.available = rng.choice(self.action_pool, self.num_available, replace=False)
 
-        # An empty table.
         if self._bullet is None:
             self._bullet = Bullet()
-        empty_world(self._bullet)
+        empty_world(self._bullet)  # the table
         self._bodies = []  # Bullet's numbers
         self.shape_ids = []  # ids of the shapes in the scene, the two cylinders first
         self._steps = 0
@@ -640,13 +639,12 @@ class StackingEnv(gym.Env):
         # [here] A place beyond [-1, 1], which an unclipped Gaussian policy may ask for, also does
         # nothing: clipped, it would be a place that the policy did not choose.
         shape_id = self.available[choice]
-        placed = shape_id in self.shape_ids[2:]
         inside = (np.abs(position) <= 1).all()
 
         # Drop the shape and wait until the scene has settled. Coordinates that the agent does not
         # decide are 0, the centre of the table (C.6). [code] What still moves, because 300 steps
         # were not enough, is halted first; it makes no measurable difference.
-        if inside and not placed and not stop:
+        if inside and shape_id not in self.shape_ids[2:] and not stop:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
             place = np.zeros(2)  # x, y
