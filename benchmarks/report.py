@@ -238,7 +238,8 @@ def draw_bars(path: Path, cells: Cells) -> None:
     for (place, method), cell in cells.items():
         axis = axes[places.index(place)]
         title, _, steps = names(place, method)
-        axis.set(title=f"{title}, {steps} steps", xlabel=ENVIRONMENTS[place[0]][1])
+        title = f"{title}, {steps} steps".replace(", ", "\n", 1)  # panels are narrow
+        axis.set(title=title, xlabel=ENVIRONMENTS[place[0]][1])
         y = methods.index(method)
         for at, phase, alpha in ((y - 0.2, "test", 1.0), (y + 0.2, "train", 0.4)):
             seeds = cell.get(phase)
