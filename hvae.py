@@ -436,8 +436,7 @@ class ObservationModel(nn.Module):
         # shape: of one raw observation, (L, F), (L, S, S) or (S, S). latents: their sizes.
         super().__init__()
         self.args = args
-        # Of trajectories; other modalities correct them below.
-        features = shape[-1]  # F
+        features = shape[-1]  # F, of trajectories; other modalities correct these numbers below
         steps = shape[0] - 1  # T
         sigmas = features  # the decoder's log-variances: one per number or pixel, for all T steps
         if args.modality == "onehot":
