@@ -495,18 +495,20 @@ class Agent(nn.Module):
         W_s, W_c = self.utility_hidden.weight.chunk(2, dim=1)  # (H, H) each
         project = self.action_project
         state_part = F.linear(code, W_s, self.utility_hidden.bias)  # (B, H)
-        # For the actions, two linear maps follow each other, P and then W_c. They are one map.
+        # For the actions, two linear maps follow each other, P and then W_c. They are one map. Most
+        # actions are available in many rows of the batch, so the U different ones are mapped once.
         weight = W_c @ project.weight  # (H, H) @ (H, D) -> (H, D)
         bias = W_c @ project.bias  # (H,)
-        action_part = F.linear(self.table, weight, bias)  # (A, H)
+        ids, number = available.unique(return_inverse=True)  # (U,), (B, K): ids[number] = available
+        action_part = F.linear(self.table[ids], weight, bias)  # (U, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
         # into the processor's cache, so they are made in pieces of 800,000 numbers (3 MB) [here].
         piece = max(1, 800_000 // (available.shape[1] * code.shape[1]))
         logits = []
-        for states, ids in zip(state_part.split(piece), available.split(piece), strict=True):
-            actions = action_part.index_select(0, ids.flatten())  # faster than [ids]; (b * K, H)
-            hidden = states[:, None] + actions.unflatten(0, ids.shape)  # (b, 1, H) + (b, K, H)
+        for states, n in zip(state_part.split(piece), number.split(piece), strict=True):
+            actions = action_part.index_select(0, n.flatten())  # faster than [n]; (b * K, H)
+            hidden = states[:, None] + actions.unflatten(0, n.shape)  # (b, 1, H) + (b, K, H)
             logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
         return torch.cat(logits) + self.utility_out.bias
 
