@@ -174,7 +174,8 @@ TABLE_3 = {
     # stacking [code]: 40 episodes, too few to tell checkpoints apart.
     "valid_episodes": (640, 160, 640, 200),
 }
-PRESETS = {}  # environment -> Args with its column of the table
+# Each column of the table, put over the defaults of Args, is the recipe of one environment.
+PRESETS = {}
 for number, environment in enumerate(TABLE_3["env"]):
     PRESETS[environment] = Args(**{name: row[number] for name, row in TABLE_3.items()})
 
@@ -183,7 +184,8 @@ GAE_LAMBDA = 0.95  # [code]
 MAX_GRAD_NORM = 0.5  # [code]
 LR_FLOOR = 0.1  # [code]: the learning rate falls to this fraction
 
-# The fast recipe: every difference from Tables 3 and 4, all of them [here], with its reason.
+# The fast recipe: every difference from Tables 3 and 4, all of them [here], with its reason. It is
+# for a laptop: a quarter of the published steps or fewer, and more learned from each of them.
 FAST = {
     "gridworld": dict(
         one_hot=True,  # a cell's id is a name, not a quantity
@@ -328,6 +330,7 @@ def cnn(frames, H, small):
         # [here] 42 -> 21 -> 11 -> 6. At 6 x 6 the features still show where the balls are.
         channels = [frames, 16, 32, 64]
         features = 64 * 6 * 6
+    # Each convolution sees twice as far as the one before it, in half the resolution.
     layers = []
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
@@ -390,6 +393,8 @@ class Agent(nn.Module):
         self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
 
         # f_omega and the critic V. With pictures they share the convolutions, else nothing [code].
+        # The critic does not see the available actions: V is the value of a state for an average
+        # set of them, and what a good or a bad set adds is noise to it.
         state = envs.single_observation_space["state"]
         self.is_image = len(state.shape) == 3
         if self.is_image:
@@ -639,6 +644,7 @@ def episode_means(episodes):
 
 def rollout(envs, obs, agent, num_steps):
     """Play T steps: a batch of (T, N, ...) tensors, the next observation, the ended episodes."""
+    # Episodes do not end with the rollout: the next one goes on where this one stops.
     transitions = []
     episodes = []
     for _ in range(num_steps):
@@ -677,6 +683,8 @@ def running_returns(rewards, dones, G, gamma):
 
     G <- gamma G + r at every step, 0 after an episode. All G (T, N), and the last to go on with.
     """
+    # Why not the true returns, which look ahead? They would have to wait for the episode's end. The
+    # past sums are there at once, and over many episodes they spread about as widely.
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
         G = gamma * G + rewards[t]
@@ -723,6 +731,8 @@ def update(agent, optimizer, batch, ent_coef):
     # Advantages are normalised over the whole rollout [code], with those of all processes.
     advantages = torch.cat(gather_from_all(flat["advantage"].cpu()))
     flat["advantage"] = (flat["advantage"] - advantages.mean()) / (advantages.std() + 1e-5)
+    # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
+    # the first of them the policy is no longer the one that played, hence the ratio in ppo_loss.
     parameters = list(agent.parameters())
     for _ in range(agent.args.update_epochs):
         order = torch.randperm(len(flat["value"]), device=agent.table.device)
@@ -881,6 +891,7 @@ def evaluate(agent, phase, episodes, stream):
     torch.manual_seed(seeds(1, *stream)[0])
     # 40 environments [code]. [code] counts the first 5,000 episodes to end, which favours short
     # ones; [here] each environment plays the same number.
+    # An environment that is done goes on playing, unheard, until the slowest is done, too.
     N = min(episodes, 40)
     to_play = np.full(N, episodes // N)
     to_play[: episodes % N] += 1
@@ -984,6 +995,8 @@ def load_table(args):
     """The representations (A, D); trains the encoder if its table is not there yet."""
     if args.finetune:  # the policy goes on with the table it knows
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
+    # Representations made by hand: an environment computes them from what it knows of its actions.
+    # "engineered-5d" is its variant "5d".
     if args.representation.startswith("engineered"):
         module = hvae.load_environment(args.env)
         options = {}
@@ -994,6 +1007,8 @@ def load_table(args):
         table = module.engineered_representations(**options)
         hvae.check_table("engineered_representations", table, module)
         return table
+    # A file that hvae.py has written. It has to be of this environment and of this split: another
+    # encoder may have seen actions that are unseen here.
     path = Path(args.representation)
     if path.suffix == ".npz":
         return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
@@ -1005,14 +1020,18 @@ def load_table(args):
     changes.update(runs_dir=args.runs_dir, device=args.device, **ENCODERS[args.representation])
     encoder = replace(encoder, **changes)
     path = hvae.representation_path(encoder)
-    if not path.exists():
-        print(f"no {path} yet: training the encoder first", flush=True)
-        hvae.train(encoder)
+    print(f"representations: {path}", flush=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{path}.lock"):  # two runs that start together train the encoder once
+        if not path.exists():
+            hvae.train(encoder)
     return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
 
 
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
+    # The new policy has to be the old one in all that shapes its networks, and the split has to be
+    # the same: else "new actions" would be actions that the old policy was trained with.
     theirs = load(folder / "best.pt")
     for name in ("env", "method", "split", "split_seed"):
         there = getattr(theirs["args"], name)
@@ -1020,6 +1039,7 @@ def start_from(agent, folder):
             raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
     if agent.args.method == "nearest-neighbor":
         # Its outputs are actions, so they start anew; [code] does so with the stop head, too.
+        # By their names in the dictionary of weights, the old ones are replaced by untrained ones.
         own = agent.state_dict()
         anew = [name for name in own if name.startswith(("head.", "fc_stop."))]
         theirs["agent"].update({name: own[name] for name in anew})
@@ -1035,6 +1055,7 @@ def choose_device(args):
 
 def check(args):
     """UserError, before anything is written, for what cannot be trained."""
+    # Names that only some environments know; each lists its own.
     module = hvae.load_environment(args.env)
     names = dict(split="SPLITS", task="TASKS", placement="PLACEMENTS")
     for option, allowed in names.items():
@@ -1146,6 +1167,8 @@ def write_json(path, content):
 class Log:
     """A run's metrics.csv, TensorBoard events and progress bar."""
 
+    # metrics.csv has one row per rollout; scores stand only in the rows of evaluations. TensorBoard
+    # shows the same numbers: tensorboard --logdir runs.
     def __init__(self, args, folder, step, size):
         from torch.utils.tensorboard import SummaryWriter  # here, because it takes 1.5 s
 
@@ -1177,6 +1200,8 @@ class Log:
 
 def finish(folder, agent, phases, step, seconds):
     """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
+    # The last policy is forgotten; what is tested is the one that validation has selected. Test
+    # actions are met here for the first time, and what they say changes nothing any more.
     args = agent.args
     best = load(folder / "best.pt")
     put(best, folder, agent=agent)
@@ -1202,6 +1227,7 @@ def finish(folder, agent, phases, step, seconds):
 
 def plot_curve(folder, metric):
     """C.7, Figure 14: scores over steps; not held at their maximum, as the published ones are."""
+    # The distance between the two lines is what the policy has learned by heart.
     os.environ.pop("MPLBACKEND", None)  # one inherited from a notebook ends the import
     from matplotlib.figure import Figure  # not pyplot, which looks for a display
 
@@ -1296,6 +1322,8 @@ def evaluate_run(options):
     args = best["args"]
     module = hvae.load_environment(args.env)
     phases, train_ids = action_phases(args)
+    # The pool and K of the run's own test, and what the options change of them. A policy that was
+    # adapted (C.2) knows one fixed set, which is called "train".
     part = "train" if args.adapt else options.actions
     pool, K = phases[part]
     pool = restrict_pool(options, module, best["agent"]["table"], pool, phases["learn"][0])
@@ -1339,7 +1367,8 @@ def parse_args(words):
 
 def main(words):
     """Train what the command line says, or evaluate what was trained."""
-    torch.set_num_threads(1)  # for layers this small a second thread waits more than it works
+    # For layers as small as these, a second thread waits more than it works.
+    torch.set_num_threads(1)
     if words[:1] == ["evaluate"]:
         prog = "ppo_actiongen.py evaluate"
         return evaluate_run(tyro.cli(EvaluateArgs, args=words[1:], prog=prog))
