@@ -27,17 +27,18 @@ C.3 `--no-subgoal-reward`; C.4 `--aux-conditioned`; C.5 `--fully-observable`; C.
     python ppo_actiongen.py my_env.py                 # an environment of your own: see README.md
     python ppo_actiongen.py evaluate runs/gridworld-s0 --num-available 20  # see evaluate --help
 
-In the order of this file: hyper-parameters (Tables 3 and 4; lengths of episodes and states are the
-environments'); torchrun; networks (D.3.2, C.4); the main paper's Algorithm 1, training, and
-Algorithm 2, acting with unseen actions; then what surrounds them: which actions are available,
-checks, the run's folder, the command `evaluate` (A.3), the command line.
+In the order of this file: hyper-parameters (Tables 3 and 4, without what the environments fix: how
+long episodes are, what a state holds); torchrun; random numbers; networks (D.3.2, C.4); the main
+paper's Algorithm 1, training, and Algorithm 2, acting with unseen actions; then what surrounds
+them: which actions are available, checks, the run's folder, the command `evaluate` (A.3), the
+command line.
 
 Letters in shapes: T steps of a rollout, N environments, B rows of a batch, K available actions,
-A all actions, D numbers in a representation, H hidden units. The *code* of a state is f_omega(s). A
-step is one action of one environment. A *score* is the environment's METRIC at the end of an
-episode (success, click-through rate, height), a return the sum of its rewards. Two marks: [code] is
-the authors' released implementation, followed where the appendix is silent and in the few places
-that say so; [here] is a choice of this repository, with its reason.
+A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
+f_omega(s). A step is one action of one environment. A *score* is the environment's METRIC at the
+end of an episode (success, click-through rate, height), a return the sum of its rewards. Two marks:
+[code] is the authors' released implementation, followed where the appendix is silent and, where it
+says so, against the appendix; [here] is a choice of this repository, with its reason.
 """
 
 import atexit
@@ -202,11 +203,13 @@ FAST = {
         hidden_size=256,  # 64 units fit the user's taste less well
         gamma=0.0,  # a click depends on this recommendation, hardly on earlier ones
         minibatch_size=512,  # as in Grid World
-        num_available=100,  # a fifth of the cost of a step
+        num_available=100,  # a fifth of the cost of the utilities
         eval_available=500,  # tests keep the number of Table 3
         total_timesteps=10_000_000,
     ),
     "create": dict(
+        num_available=20,  # as in Grid World: other tools than the favourites are tried
+        eval_available=50,  # tests keep the number of Table 3
         small_pictures=True,  # thin black lines on white: convolutions see mostly the white
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         published_init=False,  # as in Grid World
@@ -266,7 +269,7 @@ def default_args(env="gridworld", recipe="fast", quick=False):
 # Started by `torchrun --nproc_per_node=2 ppo_actiongen.py ...`, each process (its number is RANK)
 # plays its share of the environments and learns from its share of every minibatch. Gradients are
 # averaged, so all processes keep the same weights. Rank 0 alone evaluates, writes and prints.
-# Started by `python`, there is one process, and these two functions do nothing.
+# Started by `python`, there is one process, and these two functions have nothing to collect.
 RANK = int(os.environ.get("RANK", 0))
 WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 
@@ -334,7 +337,7 @@ def cnn(frames, H, small):
     layers = []
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
-        if small:  # [code] keeps PyTorch's weights, with which all pictures look nearly the same
+        if small:  # with PyTorch's own weights [code] all pictures give nearly the same features
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
@@ -448,10 +451,11 @@ class Agent(nn.Module):
         """The layers behind alpha, or beta, of the Beta distribution over positions."""
         H = self.args.hidden_size
         dims = self.action_parts["position"].shape[0]
-        if not self.args.aux_conditioned:  # D.3.2: linear, from the code of the state
+        if not self.args.aux_conditioned:  # D.3.2: linear, from the encoding of the state
             return layer_init(nn.Linear(H, dims), 1.0)
-        # C.4: two layers, from the code and the projected action (B, 2H). With a last layer of gain
-        # 1 [code] each state has a favourite place before training. [here] all start alike.
+        # C.4: two layers, from the state's encoding and the projected action (B, 2H). With a gain
+        # of 1 in the last one [code], each state has a favourite place before training. In the fast
+        # recipe all start alike.
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -465,12 +469,12 @@ class Agent(nn.Module):
         return state.to(self.table.device), available.to(self.table.device)
 
     def encode(self, state):
-        """States (B, ...) -> their codes f_omega(s) (B, H) and values V(s) (B,)."""
+        """States (B, ...) -> their encodings f_omega(s) (B, H) and values V(s) (B,)."""
         if self.is_image:  # grey levels 0..255 -> 0..1
-            code = self.encoder(state.float() / 255)
-            return code, self.critic(code).squeeze(1)
-        # Numbers are brought to mean 0 and standard deviation 1 [code]. If they are ids of cells, a
-        # number says less than a vector with a single 1 at the place of the id.
+            encoding = self.encoder(state.float() / 255)
+            return encoding, self.critic(encoding).squeeze(1)
+        # If the numbers of a state are ids of cells, a vector with a single 1 at its place says
+        # more than the number. All others are brought to mean 0 and standard deviation 1 [code].
         if self.args.one_hot:
             number = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
             x = F.one_hot(number, len(self.cell_ids)).flatten(1).float()  # (B, cells * ids)
@@ -479,13 +483,13 @@ class Agent(nn.Module):
             x = ((state - mean) / std).clamp(-10, 10).flatten(1)  # [code]; (B, numbers)
         return self.encoder(x), self.critic(x).squeeze(1)
 
-    def utility(self, code, available):
-        """f_nu (D.3.2): codes (B, H) and ids of available actions (B, K) -> logits (B, K)."""
-        if self.args.bilinear:  # [here] c . M s, where the layer utility_query is M
-            query = self.utility_query(code)  # (B, D)
+    def utility(self, encoding, available):
+        """f_nu (D.3.2): encodings (B, H) and ids of available actions (B, K) -> logits (B, K)."""
+        if self.args.bilinear:  # [here] c . (M s + m); the layer utility_query has M and its bias m
+            query = self.utility_query(encoding)  # (B, D)
             return torch.einsum("bd,bkd->bk", query, self.table[available])
 
-        # How good is it to take the action with representation c in a state with code s? D.3.2 asks
+        # How good is it to take the action with representation c in a state with encoding s? D.3.2:
         #
         #     hidden = ReLU(W [s; project(c)] + b),    logit = out(hidden).
         #
@@ -499,32 +503,32 @@ class Agent(nn.Module):
         # at a fraction of the cost. (exercises/README.md, 2: write the concatenation.)
         W_s, W_c = self.utility_hidden.weight.chunk(2, dim=1)  # (H, H) each
         project = self.action_project
-        state_part = F.linear(code, W_s, self.utility_hidden.bias)  # (B, H)
+        state_part = F.linear(encoding, W_s, self.utility_hidden.bias)  # (B, H)
         # For the actions, two linear maps follow each other, P and then W_c. They are one map. Most
         # actions are available in many rows of the batch, so the U different ones are mapped once.
         weight = W_c @ project.weight  # (H, H) @ (H, D) -> (H, D)
         bias = W_c @ project.bias  # (H,)
-        ids, number = available.unique(return_inverse=True)  # (U,), (B, K): ids[number] = available
+        ids, row_of = available.unique(return_inverse=True)  # (U,), (B, K): ids[row_of] = available
         action_part = F.linear(self.table[ids], weight, bias)  # (U, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
         # into the processor's cache, so they are made in pieces of 800,000 numbers (3 MB) [here].
-        piece = max(1, 800_000 // (available.shape[1] * code.shape[1]))
+        piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
-        for states, n in zip(state_part.split(piece), number.split(piece), strict=True):
-            actions = action_part.index_select(0, n.flatten())  # faster than [n]; (b * K, H)
-            hidden = states[:, None] + actions.unflatten(0, n.shape)  # (b, 1, H) + (b, K, H)
+        for states, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
+            actions = action_part.index_select(0, rows.flatten())  # faster than [rows]; (b * K, H)
+            hidden = states[:, None] + actions.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
             logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
         return torch.cat(logits) + self.utility_out.bias
 
-    def choice_policy(self, code, available):
+    def choice_policy(self, encoding, available):
         """What is drawn from: K logits or, in a baseline, n logits or a Gaussian."""
         if self.args.method == "nearest-neighbor":  # one of the n training actions
-            return Categorical(logits=self.head(code))  # (B, n)
+            return Categorical(logits=self.head(encoding))  # (B, n)
         if self.args.method == "continuous":  # a point in the space of representations [code]
-            std = F.softplus(self.head_var(code)).sqrt()
-            return Normal(self.head_mean(code), std)  # (B, D)
-        return Categorical(logits=self.utility(code, available))  # (B, K)
+            std = F.softplus(self.head_var(encoding)).sqrt()
+            return Normal(self.head_mean(encoding), std)  # (B, D)
+        return Categorical(logits=self.utility(encoding, available))  # (B, K)
 
     def index_of(self, drawn, available):
         """Which of the available actions is meant by what was drawn, (B,) in 0..K-1."""
@@ -547,14 +551,15 @@ class Agent(nn.Module):
         means), "action_id" (its id), and "position" and "stop" where the environment has them.
         """
         # The policy is a product of up to three distributions: which action, where, and whether to
-        # stop. So their log-probabilities add up, and so do their entropies.
+        # stop. So their log-probabilities add up. Their entropies are added up for the bonus; that
+        # of the position has a weight of its own (Table 3) and, in C.4, is the chosen action's.
         is_new = action is None
         if is_new:
             action = {}
-        code, value = self.encode(state)
+        encoding, value = self.encode(state)
 
         # Which action.
-        policy = self.choice_policy(code, available)
+        policy = self.choice_policy(encoding, available)
         if is_new:
             action["drawn"] = policy.sample()
             action["choice"] = self.index_of(action["drawn"], available)
@@ -570,10 +575,10 @@ class Agent(nn.Module):
         # Where to place it: a Beta distribution for each dimension (D.3.2). With parameters above 1
         # it has a single peak.
         if "position" in self.action_parts:
-            x = code
+            x = encoding
             if self.args.aux_conditioned:  # C.4
                 chosen = self.action_project(self.table[action["action_id"]])  # (B, H)
-                x = torch.cat([code, chosen], dim=1)  # (B, 2H)
+                x = torch.cat([encoding, chosen], dim=1)  # (B, 2H)
             place = Beta(1 + F.softplus(self.fc_alpha(x)), 1 + F.softplus(self.fc_beta(x)))
             if is_new:
                 action["position"] = 2 * place.sample() - 1  # (B, dims), from [0, 1] to [-1, 1]
@@ -584,7 +589,7 @@ class Agent(nn.Module):
 
         # Whether to stop here (A.4: "a binary episode termination action").
         if "stop" in self.action_parts:
-            stop = Categorical(logits=self.fc_stop(code))
+            stop = Categorical(logits=self.fc_stop(encoding))
             if is_new:
                 action["stop"] = stop.sample()
             logprob = logprob + stop.log_prob(action["stop"])
@@ -597,7 +602,7 @@ class Agent(nn.Module):
 # 1. Train the encoder on training actions, then compute c_i for all actions (hvae.py).
 # 2. Repeat: at every reset draw K training actions; play; update by PPO with an entropy bonus;
 #    now and then score on validation actions, and keep the best policy.
-# Algorithm 2 is `evaluate`: the kept policy with K unseen actions per episode, nothing is learned.
+# Algorithm 2 is evaluate(): the kept policy with K unseen actions per episode, nothing is learned.
 
 
 @torch.no_grad()
@@ -679,12 +684,12 @@ def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
 
 
 def running_returns(rewards, dones, G, gamma):
-    """Discounted sums of *past* rewards, of which only the spread is used (NormalizeReward).
+    """Discounted sums of the rewards up to now; only their spread is used (NormalizeReward).
 
     G <- gamma G + r at every step, 0 after an episode. All G (T, N), and the last to go on with.
     """
     # Why not the true returns, which look ahead? They would have to wait for the episode's end. The
-    # past sums are there at once, and over many episodes they spread about as widely.
+    # sum up to now is known at once, and all that is needed is a rough size of the returns.
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
         G = gamma * G + rewards[t]
@@ -695,7 +700,8 @@ def running_returns(rewards, dones, G, gamma):
 
 def ppo_loss(agent, mb, ent_coef):
     """PPO's clipped loss of one minibatch, and the numbers of it that go into metrics.csv."""
-    # How much likelier is each action now than when it was played? (mb also holds its parts.)
+    # How much likelier is each action now than when it was played? The minibatch itself can be
+    # handed over as the action, since play_step has put the action's entries into it.
     args = agent.args
     _, logprob, entropy, value = agent.act(mb["state"], mb["available"], action=mb)
     logratio = logprob - mb["logprob"]
@@ -752,8 +758,9 @@ def update(agent, optimizer, batch, ent_coef):
 
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
-    # A phase is a pair: the pool of actions, and the number K of them that is available. "learn" is
-    # what the policy is trained with; it is scored in "train" (the same actions) and "valid".
+    # A phase is a pair: the pool of actions, and the number K of them that is available. The policy
+    # is trained in "learn" and scored in "train" and "valid". "learn" and "train" have one pool,
+    # but may differ in K: Grid World's fast recipe learns with 20 available actions, tests have 50.
     check(args)
     phases, train_ids = action_phases(args)
     # Rank 0 makes the run's folder and, if there is no table of representations yet, trains the
@@ -838,7 +845,7 @@ def train(args):
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
         # with actions which neither encoder nor policy was trained on. Test actions are not looked
-        # at before the end: the best of many noisy scores is a bit too good, the test is not.
+        # at before the end: the best of many noisy scores is optimistic, the test is not.
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
@@ -872,7 +879,8 @@ def train(args):
     if RANK:
         return {}
 
-    # Test, once (Algorithm 2): the selected policy, frozen, with actions it has never met.
+    # Test, once (Algorithm 2): the selected policy, frozen, with actions it has never met (in C.2:
+    # with those that it was adapted to).
     log.close()
     return finish(folder, agent, phases, step, seconds)
 
@@ -884,14 +892,14 @@ def evaluate(agent, phase, episodes, stream):
     """The frozen policy with actions of a phase, (action_pool, K): means over `episodes` episodes.
 
     Nothing is learned here; new actions only bring their rows of the table. Every episode has its
-    own K of them. Actions are drawn, as in training, not the likeliest taken [code]. `stream` names
-    the random numbers, see `seeds`. Returns score, its standard error over episodes (the paper's is
-    over 5 seeds, 8 in Grid World), return, length, episodes.
+    own K of them (or all). Actions are drawn, as in training, not the likeliest taken [code].
+    `stream` names the random numbers, see `seeds`. Returns score, its standard error over episodes
+    (the paper's is over 5 seeds, 8 in Grid World), return, length, episodes.
     """
     torch.manual_seed(seeds(1, *stream)[0])
     # 40 environments [code]. [code] counts the first 5,000 episodes to end, which favours short
-    # ones; [here] each environment plays the same number.
-    # An environment that is done goes on playing, unheard, until the slowest is done, too.
+    # ones; [here] of each environment the same number is counted. One that
+    # has played its share goes on, unheard, until the slowest is done, too.
     N = min(episodes, 40)
     to_play = np.full(N, episodes // N)
     to_play[: episodes % N] += 1
@@ -948,7 +956,7 @@ def make_envs(args, phase, num_envs, stream):
 
 
 def action_phases(args):
-    """For each phase (action_pool, K); and all ids (n,) that can be available while training.
+    """Phases, name -> (action_pool, K); and all ids (n,) that can be available while training.
 
     UserError if parts of the split overlap, or if a pool has fewer than K actions.
     """
@@ -965,9 +973,9 @@ def action_phases(args):
     eval_K = args.eval_available or learn_K
     train_K = eval_K
     # Three cases learn with a fixed set instead, and "train" scores them on it: nearest neighbour,
-    # the ablation without subsampling, and C.2. All of the set is available all the time. [code]
-    # makes it smaller where the utility of every action would cost too much; the outputs of nearest
-    # neighbour are cheap.
+    # the ablation without subsampling, and C.2. All of the set is available all the time. Where the
+    # utility of every action would cost too much, fixed_set_size makes it smaller [code]; the
+    # outputs of nearest neighbour are cheap.
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
@@ -1013,25 +1021,26 @@ def load_table(args):
     if path.suffix == ".npz":
         return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
 
-    # The encoder learns from training actions only (but for "hvae-all"); then it encodes all of
-    # them. One table serves all seeds of the policy, as published: the encoder's seed stays 0.
-    encoder = hvae.default_args(args.env, args.hvae_recipe, args.modality)
+    # The encoder is trained on training actions only (but for "hvae-all"). Then it gives every
+    # action a representation, the unseen ones, too: the mean of q(c | observations). One table
+    # serves all seeds of the policy, as published: the encoder's seed stays 0.
+    encoder_args = hvae.default_args(args.env, args.hvae_recipe, args.modality)
     changes = dict(split=args.split, split_seed=args.split_seed)
     changes.update(runs_dir=args.runs_dir, device=args.device, **ENCODERS[args.representation])
-    encoder = replace(encoder, **changes)
-    path = hvae.representation_path(encoder)
+    encoder_args = replace(encoder_args, **changes)
+    path = hvae.representation_path(encoder_args)
     print(f"representations: {path}", flush=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(f"{path}.lock"):  # two runs that start together train the encoder once
         if not path.exists():
-            hvae.train(encoder)
+            hvae.train(encoder_args)
     return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
 
 
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
-    # The new policy has to be the old one in all that shapes its networks, and the split has to be
-    # the same: else "new actions" would be actions that the old policy was trained with.
+    # Another split would make "new actions" of some that the old policy was trained with. What
+    # shapes the networks need not be compared: `put` names the layers that do not fit.
     theirs = load(folder / "best.pt")
     for name in ("env", "method", "split", "split_seed"):
         there = getattr(theirs["args"], name)
@@ -1200,8 +1209,8 @@ class Log:
 
 def finish(folder, agent, phases, step, seconds):
     """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
-    # The last policy is forgotten; what is tested is the one that validation has selected. Test
-    # actions are met here for the first time, and what they say changes nothing any more.
+    # The last policy is forgotten; what is tested is the one that validation has selected. But for
+    # C.2, test actions are met here for the first time, and what they say changes nothing any more.
     args = agent.args
     best = load(folder / "best.pt")
     put(best, folder, agent=agent)
@@ -1226,7 +1235,7 @@ def finish(folder, agent, phases, step, seconds):
 
 
 def plot_curve(folder, metric):
-    """C.7, Figure 14: scores over steps; not held at their maximum, as the published ones are."""
+    """C.7, Figure 14: scores over steps, as measured (published curves show the best so far)."""
     # The distance between the two lines is what the policy has learned by heart.
     os.environ.pop("MPLBACKEND", None)  # one inherited from a notebook ends the import
     from matplotlib.figure import Figure  # not pyplot, which looks for a display
@@ -1292,11 +1301,11 @@ def restrict_pool(options, module, table, pool, known):
         if share is not None and not 0 <= share <= 1:
             raise UserError(f"{share} is no share between 0 and 1")
     if far is not None:
-        # Squared distance to the nearest representation of a training action. The published limits
-        # fit the scale of one encoder; a share of the pool means the same for all of them.
+        # Distance to the nearest representation of a training action. [code] has limits in its
+        # units, which fit one encoder; a share of the pool means the same for all of them.
         distances = torch.cdist(table[pool].double(), table[known].double())  # (m, n)
-        squared = distances.amin(1).square().numpy()
-        pool = pool[squared >= np.quantile(squared, far)]
+        nearest = distances.amin(1).numpy()
+        pool = pool[nearest >= np.quantile(nearest, far)]
     if gap is not None:
         # Only tools that differ by so much from every training tool's angle.
         if not hasattr(module, "angle_gaps"):
