@@ -12,6 +12,7 @@ A picture shows each environment at one number of steps, the one most methods of
 import os
 import re
 import sys
+import textwrap
 from collections import Counter, defaultdict
 from functools import partial
 from pathlib import Path
@@ -322,7 +323,8 @@ def section(name: str, draw: bool) -> str:
         for (place, method), points in group(rows, "step", "valid_score", True).items():
             lines = [("training actions", seen[place, method], dict(color="0.5", ls="--"))]
             lines.append(("validation actions", points, dict(color=METHODS[method][1])))
-            panels["\n".join(names(place, method)[:2])] = lines
+            title, label, _ = names(place, method)
+            panels[f"{title}\n{textwrap.fill(label, 23)}"] = lines  # panels are narrow
         picture = partial(draw_lines, path, panels, "million steps", 9, 1.4)
     elif name == "fig9":
         tests = group([row for row in rows if row["phase"] == "zero-shot"])
