@@ -6,7 +6,7 @@
 A table and its picture go between `<!-- begin:NAME -->` and `<!-- end:NAME -->`, where NAME is a
 figure of benchmarks/paper.py, `<figure>-paper` for --recipe paper, `main` (the summary) or `fig14`
 (all learning curves). A page has the markers it wants; what has no results stays empty.
-A picture shows each environment at one number of steps, the one most methods of the figure have.
+A picture shows each task at one number of steps, the one that most methods of the figure have.
 """
 
 import os
@@ -138,12 +138,12 @@ def tested(phase: str) -> float:
 
 def group(rows: list[dict], phase="phase", column="score", every=False) -> Cells:
     """A column's numbers by place, method, phase (or another column), in the order of METHODS."""
-    # Unless `every`, one number of steps per environment: that of most methods, or the largest.
+    # Unless `every`, one number of steps per task: that of most methods, or the largest.
     rows = [row | {"steps": int(row["steps"] or 0)} for row in rows]
     usual: dict[str, tuple] = {}
-    runs = {(row["env"], row["steps"], row["method"]) for row in rows}
-    for (env, steps), n in Counter(run[:2] for run in runs).items():
-        usual[env] = max(usual.get(env, (0, 0)), (n, steps))
+    runs = {(row["env"], row["task"], row["steps"], row["method"]) for row in rows}
+    for (*task, steps), n in Counter(run[:3] for run in runs).items():
+        usual[tuple(task)] = max(usual.get(tuple(task), (0, 0)), (n, steps))
     tasks = list(dict.fromkeys((row["env"], row["task"]) for row in rows))
 
     def order(row):
@@ -152,7 +152,7 @@ def group(rows: list[dict], phase="phase", column="score", every=False) -> Cells
 
     cells: Cells = defaultdict(lambda: defaultdict(list))
     for row in sorted(rows, key=order):
-        if row[column] and (every or row["steps"] == usual[row["env"]][1]):
+        if row[column] and (every or row["steps"] == usual[row["env"], row["task"]][1]):
             place = (row["env"], row["task"], row["steps"])
             cells[place, row["method"]][row[phase]].append(float(row[column]))
     return cells
