@@ -56,6 +56,8 @@ def test_a_recipe_is_itself_but_for_the_methods_own_flags(recipe):
         usual = asdict(ppo_actiongen.default_args(job.args.env, recipe, job.args.quick))
         if job.args.env == "recsys" and "bilinear" not in job.row:
             usual["hidden_size"] = 64  # Table 4: the paper's methods keep it, in every recipe
+        if "ours_50" in job.row:  # the fast recipe with Table 3's number of available tools
+            usual["num_available"] = 50
         differs = {k for k, v in asdict(job.args).items() if v != usual[k]}
         assert differs <= set(METHOD.split()) and job.args.seed == 3, job.command
         assert job.args.split_seed == 3 * (job.args.env in ("gridworld", "recsys"))
