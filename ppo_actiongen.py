@@ -8,9 +8,9 @@ a softmax turns the numbers of the available actions into probabilities:
     pi(a_i | s) = exp f_nu(c_i, f_omega(s)) / sum of exp f_nu(c_j, f_omega(s)) over available a_j
 
 A new action is then just another vector. The policy must not learn the training actions by heart,
-so there are three regularisers, marked *so* below: *subsampling*, every episode has its own random
-subset of the training actions; an *entropy bonus*; and *validation*, the policy that is kept is the
-one that does best with actions held out for this choice.
+so there are three regularisers (search for "regulariser" to find their lines): *subsampling*, every
+episode has its own random subset of the training actions; an *entropy bonus*; and *validation*, the
+policy that is kept is the one that does best with actions held out for this choice.
 
 Baselines: `nearest-neighbor` has an output per training action and executes the available action
 nearest to the one it drew; `continuous` draws a point in the space of representations and executes
@@ -18,7 +18,7 @@ the available action nearest to it; `--representation vae` takes a VAE without h
 Ablations: `--ent-coef 0`, `--no-subsample`. Appendix C: C.1 `--task`; C.2 `--finetune`, `--adapt`;
 C.3 `--no-subgoal-reward`; C.4 `--aux-conditioned`; C.5 `--fully-observable`; C.6 `--placement`,
 `--split full`; C.7 curve.png of every run. A.3's analyses: `create --split analysis
---representation hvae-all`, then `evaluate RUN --min-angle-gap 9` and its other options.
+--representation hvae-all`, then `evaluate RUN --min-angle-gap 5` and its other options.
 
     python ppo_actiongen.py gridworld --quick         # minutes; or: recsys, create, stacking
     python ppo_actiongen.py gridworld --recipe paper  # the policy of Tables 3 and 4
@@ -36,9 +36,9 @@ command line.
 Letters in shapes: T steps of a rollout, N environments, B rows of a batch, K available actions,
 A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
 f_omega(s). A step is one action of one environment. A *score* is the environment's METRIC at the
-end of an episode (success, click-through rate, height), a return the sum of its rewards. Two marks:
-[code] is the authors' released implementation, followed where the appendix is silent and, where it
-says so, against the appendix; [here] is a choice of this repository, with its reason.
+end of an episode (success, click-through rate, height). Two marks: [code] is the authors' released
+implementation, followed where the appendix is silent (a comment says so where the two disagree);
+[here] is a choice of this repository, with its reason.
 """
 
 import atexit
@@ -94,8 +94,8 @@ class Args:
     quick: bool = False  # the same protocol in minutes, with fewer steps
     method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # or a baseline
     seed: int = 0  # one seed is one run, bit for bit, on one kind of CPU
-    adapt: bool = False  # train on the test actions, a fixed set of them (C.2)
-    finetune: str | None = None  # --adapt, starting from the policy in this run's folder (C.2)
+    adapt: bool = False  # train on the test actions, all of them available all the time (C.2)
+    finetune: str | None = None  # --adapt, from the policy and the table in that run's folder (C.2)
 
     # --- environment ---
     split: str = "default"  # how actions are divided into training, validation and test
@@ -108,7 +108,7 @@ class Args:
     # --- action representations ---
     # hvae-all: an encoder that was trained on all actions (the oracle); vae: appendix B's baseline.
     representation: str = "hvae"  # hvae, hvae-all, vae, engineered[-5d], or a table FILE.npz
-    modality: str | None = None  # what the encoder sees: xy, video, ...; None: its usual
+    modality: str | None = None  # what the encoder sees: xy, video, ...; None: hvae.py's default
     hvae_recipe: Literal["quick", "fast", "paper"] = "fast"  # how long the encoder is trained
 
     # --- which actions are available ---
@@ -136,14 +136,14 @@ class Args:
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
-    published_init: bool = True  # initial weights of utility, position and stop as in [code]
+    published_init: bool = True  # initial weights of what chooses, places and stops as in [code]
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . M s in place of an MLP [here]
     one_hot: bool = False  # integer states enter one-hot in place of as numbers [here]
-    small_pictures: bool = False  # half-size inverted pictures and three convolutions [here]
+    small_pictures: bool = False  # half the size, white on black, three convolutions [here]
 
     # --- evaluation ---
-    eval_every: int = 410_000  # steps between two evaluations
+    eval_every: int = 409_600  # steps between two evaluations
     valid_episodes: int = 640  # episodes of one evaluation while training
     eval_episodes: int = 5000  # episodes of the final test [code]
 
@@ -168,11 +168,12 @@ TABLE_3 = {
     "representation": ("hvae", "engineered", "hvae", "hvae"),  # A.2: recsys provides them
     "task": (None, None, "push", None),
     "placement": (None, None, None, "1d"),
-    # [code]: longer than the run, so the rate falls to .46 (create) and .97 (stacking) only.
+    # D.2: the rate falls linearly over the training. [code] agrees for two of the environments. For
+    # the others it takes longer than the run, so their rates end at .46 and .97 of the first one.
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
-    "eval_every": (410_000, 164_000, 615_000, 102_400),  # 25, 20, 50, 25 rollouts
-    # stacking [code]: 40 episodes, too few to tell checkpoints apart.
+    "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
+    # As in [code], which has 40 for stacking; they cannot tell checkpoints apart, so 200 [here].
     "valid_episodes": (640, 160, 640, 200),
 }
 # Each column of the table, put over the defaults of Args, is the recipe of one environment.
@@ -195,14 +196,14 @@ FAST = {
         eval_available=50,  # tests keep the number of Table 3
         ent_floor=0.1,  # late in training a random skill mostly ends in the lava
         hidden_size=128,  # 64 units fit fewer skills
-        published_init=False,  # gradients of 1e-6 waste the first updates
+        published_init=False,  # gradients below Adam's eps waste the first updates
         total_timesteps=10_000_000,
     ),
     "recsys": dict(
         bilinear=True,  # an MLP learns single products by heart
         hidden_size=256,  # 64 units fit the user's taste less well
         gamma=0.0,  # a click depends on this recommendation, hardly on earlier ones
-        minibatch_size=512,  # as in Grid World
+        minibatch_size=512,  # more updates per step
         num_available=100,  # a fifth of the cost of the utilities
         eval_available=500,  # tests keep the number of Table 3
         total_timesteps=10_000_000,
@@ -210,7 +211,7 @@ FAST = {
     "create": dict(
         num_available=20,  # as in Grid World: other tools than the favourites are tried
         eval_available=50,  # tests keep the number of Table 3
-        small_pictures=True,  # thin black lines on white: convolutions see mostly the white
+        small_pictures=True,  # a quarter of the cost; a background of 0 adds nothing
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
@@ -230,10 +231,10 @@ FAST = {
     "stacking": dict(
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # as in CREATE
-        minibatch_size=32,  # physics is the cost, so learn more from each step
+        minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
         clip_vloss=False,  # heights, too, are large against clip_coef
         total_timesteps=400_000,
-        eval_every=20_500,
+        eval_every=20_480,
     ),
 }
 # --quick: this many steps, at least four evaluations, 500 test episodes, the encoder's quick
@@ -269,7 +270,7 @@ def default_args(env="gridworld", recipe="fast", quick=False):
 # Started by `torchrun --nproc_per_node=2 ppo_actiongen.py ...`, each process (its number is RANK)
 # plays its share of the environments and learns from its share of every minibatch. Gradients are
 # averaged, so all processes keep the same weights. Rank 0 alone evaluates, writes and prints.
-# Started by `python`, there is one process, and these two functions have nothing to collect.
+# Started by `python`, there is one process, and the two functions below have nothing to collect.
 RANK = int(os.environ.get("RANK", 0))
 WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 
@@ -291,7 +292,7 @@ def sum_over_all(x):
 # ---- random numbers ----
 
 # What random numbers are for. Each use has a stream of its own, so that, for example, a longer
-# evaluation does not change the training.
+# evaluation does not change the training. (The first weights come from the run's seed itself.)
 TRAINING = 1  # training environments
 TORCH = 2  # PyTorch's draws while training
 VALIDATION = 3  # evaluations while training
@@ -337,11 +338,13 @@ def cnn(frames, H, small):
     layers = []
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
-        if small:  # with PyTorch's own weights [code] all pictures give nearly the same features
+        # [code] keeps PyTorch's initial weights. They are so small that all pictures have nearly
+        # the same features at first, and a run of a few million steps loses time over it [here].
+        if small:
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # features grow with the number of tools in the picture; only their places matter
+    if small:  # many tools make all features larger, but only their places matter
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -393,11 +396,12 @@ class Agent(nn.Module):
         H = args.hidden_size
         D = table.shape[1]
         self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
+        # Not saved: they follow from the options, and fine-tuning (C.2) has others.
         self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
 
-        # f_omega and the critic V. With pictures they share the convolutions, else nothing [code].
-        # The critic does not see the available actions: V is the value of a state for an average
-        # set of them, and what a good or a bad set adds is noise to it.
+        # f_omega and the critic V. With pictures V is linear in f_omega(s) (D.3.2), else it has a
+        # network of its own [code]. The critic does not see the available actions: V is the value
+        # of a state for an average set of them; what a good or a bad set adds is noise to it.
         state = envs.single_observation_space["state"]
         self.is_image = len(state.shape) == 3
         if self.is_image:
@@ -406,7 +410,7 @@ class Agent(nn.Module):
         else:
             self.obs_stats = RunningMeanStd(state.shape)
             width = math.prod(state.shape)
-            if args.one_hot:  # Grid World's first states hold all ids that there are
+            if args.one_hot:  # every first grid of Grid World holds all kinds of cells
                 first_states = envs.reset()[0]["state"]
                 self.register_buffer("cell_ids", torch.as_tensor(first_states).unique())
                 width *= len(self.cell_ids)
@@ -418,12 +422,13 @@ class Agent(nn.Module):
         self.action_parts = getattr(envs.single_action_space, "spaces", {})
 
         # What chooses among the available actions. [code] starts all three layers of the utility
-        # with a gain of 0.01. Gradients shrink on their way through them to about 1e-6, and
-        # learning starts late. [here, fast recipe] only the last layer is small.
+        # with a gain of 0.01. Gradients shrink on their way through them to about 1e-6, less than
+        # Adam's eps, so its steps are small and learning starts late. Without `published_init` only
+        # the last layer is small [here].
         project_gain, hidden_gain = (0.01, 0.01) if args.published_init else (1.0, 2**0.5)
         has_mlp = args.method == "utility" and not args.bilinear
         is_conditioned = args.aux_conditioned and "position" in self.action_parts
-        if has_mlp or is_conditioned:
+        if has_mlp or is_conditioned:  # in C.4, utility and position share this layer [code]
             self.action_project = layer_init(nn.Linear(D, H), project_gain)
         if has_mlp:
             self.utility_hidden = layer_init(nn.Linear(2 * H, H), hidden_gain)
@@ -432,7 +437,7 @@ class Agent(nn.Module):
             self.utility_query = layer_init(nn.Linear(H, D), 0.01)
         elif args.method == "nearest-neighbor":  # a logit for each training action
             self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01)
-        else:  # a Gaussian over representations
+        else:  # a Gaussian over representations [code]
             self.head_mean = layer_init(nn.Linear(H, D), 1.0)
             self.head_var = layer_init(nn.Linear(H, D), 1.0)
 
@@ -454,8 +459,8 @@ class Agent(nn.Module):
         if not self.args.aux_conditioned:  # D.3.2: linear, from the encoding of the state
             return layer_init(nn.Linear(H, dims), 1.0)
         # C.4: two layers, from the state's encoding and the projected action (B, 2H). With a gain
-        # of 1 in the last one [code], each state has a favourite place before training. In the fast
-        # recipe all start alike.
+        # of 1 in the last one [code], each state has a favourite place before training; with 0.01
+        # all start alike [here].
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -551,8 +556,9 @@ class Agent(nn.Module):
         means), "action_id" (its id), and "position" and "stop" where the environment has them.
         """
         # The policy is a product of up to three distributions: which action, where, and whether to
-        # stop. So their log-probabilities add up. Their entropies are added up for the bonus; that
-        # of the position has a weight of its own (Table 3) and, in C.4, is the chosen action's.
+        # stop. So their log-probabilities add up. Their entropies are added up for the bonus, that
+        # of the position with a weight of its own (Table 3). In C.4 every action has its own
+        # distribution of positions; only that of the chosen action counts [code].
         is_new = action is None
         if is_new:
             action = {}
@@ -772,7 +778,7 @@ def train(args):
     device = choose_device(args)
     N = args.num_envs // WORLD_SIZE
     envs, _ = make_envs(args, phases["learn"], N, (args.seed, TRAINING))
-    torch.manual_seed(args.seed)
+    torch.manual_seed(args.seed)  # the first weights, the same in all processes
     agent = Agent(envs, table, train_ids, args).to(device)
     if args.finetune:
         start_from(agent, Path(args.finetune))
@@ -802,7 +808,8 @@ def train(args):
         if starts_afresh:
             # At the beginning and after every checkpoint, all random numbers and all episodes start
             # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
-            # Episodes still running are cut off; GAE has taken V of their last state for the rest.
+            # Episodes still running are dropped. Nothing is lost: the rollout before this line has
+            # been learned from, with `next_value` (below) in place of what was to come.
             torch.manual_seed(seeds(1, args.seed, TORCH, step, RANK)[0])
             obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
             G = torch.zeros(N, device=device)  # see running_returns
@@ -821,7 +828,8 @@ def train(args):
         batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
 
         # Judge. Rewards are divided by the standard deviation of a running return, so that values
-        # have one size in all environments, and clipped [code]. Not so with pictures [code].
+        # have one size in all environments, and clipped [code]. Not so with pictures [code]: there
+        # the values of CREATE reach 10, which is why its fast recipe has another vf_coef.
         rewards = batch["reward"]
         if not agent.is_image:
             returns, G = running_returns(rewards, batch["done"], G, args.gamma)
@@ -833,7 +841,8 @@ def train(args):
         batch["return"] = batch["advantage"] + batch["value"]
 
         # Learn. The statistics of the states follow afterwards, because the policy that learns has
-        # to be the one that collected; while fine-tuning they stay as they were [code].
+        # to be the one that collected. While fine-tuning they stay as they were [code]: the layers
+        # that were taken over expect just these units.
         numbers = update(agent, optimizer, batch, ent_coef)
         if not (agent.is_image or args.one_hot or args.finetune):
             agent.obs_stats.update(batch["state"].flatten(0, 1))
@@ -845,7 +854,8 @@ def train(args):
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
         # with actions which neither encoder nor policy was trained on. Test actions are not looked
-        # at before the end: the best of many noisy scores is optimistic, the test is not.
+        # at before the end: the best of many noisy scores is optimistic, the test is not. (Only
+        # the oracle encoder, hvae-all, was trained on all actions.)
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
@@ -863,9 +873,10 @@ def train(args):
         lasted = time.perf_counter() - started
         seconds += lasted
         score, total, length = episode_means(episodes)
-        row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)
+        row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)  # sps: steps per second
         row.update(train_score=train_score, valid_score=valid_score, learning_rate=learning_rate)
         row.update(episode_score=score, episode_return=total, episode_length=length, **numbers)
+        # CleanRL's 1 - var(return - value) / var(return): their difference is the advantage.
         row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
         if RANK == 0:
             log_size = log.write(row)
@@ -894,12 +905,12 @@ def evaluate(agent, phase, episodes, stream):
     Nothing is learned here; new actions only bring their rows of the table. Every episode has its
     own K of them (or all). Actions are drawn, as in training, not the likeliest taken [code].
     `stream` names the random numbers, see `seeds`. Returns score, its standard error over episodes
-    (the paper's is over 5 seeds, 8 in Grid World), return, length, episodes.
+    (published error bars are over 5 seeds, 8 in Grid World, instead), return, length, episodes.
     """
     torch.manual_seed(seeds(1, *stream)[0])
     # 40 environments [code]. [code] counts the first 5,000 episodes to end, which favours short
-    # ones; [here] of each environment the same number is counted. One that
-    # has played its share goes on, unheard, until the slowest is done, too.
+    # ones; [here] of each environment the same number is counted. One that has played its share
+    # goes on, not counted any more, until the slowest is done, too.
     N = min(episodes, 40)
     to_play = np.full(N, episodes // N)
     to_play[: episodes % N] += 1
@@ -967,7 +978,8 @@ def action_phases(args):
 
     # "learn": the policy is trained; "train": it is scored on the same actions; "valid": selects
     # the checkpoint; "test": scored once, at the end. K random actions of the pool are available in
-    # an episode: num_available in "learn", eval_available elsewhere.
+    # an episode: num_available in "learn", eval_available elsewhere. In C.2 (adapt) there are only
+    # "learn" and "train", and both have the actions that are the test actions of all other runs.
     action_pool = split["test"] if args.adapt else split["train"]
     learn_K = args.num_available
     eval_K = args.eval_available or learn_K
@@ -1004,7 +1016,7 @@ def load_table(args):
     if args.finetune:  # the policy goes on with the table it knows
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
     # Representations made by hand: an environment computes them from what it knows of its actions.
-    # "engineered-5d" is its variant "5d".
+    # Grid World has variants: "engineered-5d" is its five moves as five numbers (B).
     if args.representation.startswith("engineered"):
         module = hvae.load_environment(args.env)
         options = {}
@@ -1039,8 +1051,8 @@ def load_table(args):
 
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
-    # Another split would make "new actions" of some that the old policy was trained with. What
-    # shapes the networks need not be compared: `put` names the layers that do not fit.
+    # Another split would make "new actions" of some that the old policy was trained with. Options
+    # that decide the sizes of layers are not compared here: `put` names the layers that do not fit.
     theirs = load(folder / "best.pt")
     for name in ("env", "method", "split", "split_seed"):
         there = getattr(theirs["args"], name)
@@ -1085,7 +1097,7 @@ def check(args):
         raise UserError(f"num_envs {args.num_envs} must divide the {size} steps of a rollout")
     if args.num_envs % WORLD_SIZE or args.minibatch_size % WORLD_SIZE:
         raise UserError(f"{WORLD_SIZE} processes must divide num_envs and minibatch_size")
-    if not 2 <= size <= args.total_timesteps:
+    if size > args.total_timesteps:
         raise UserError(f"total_timesteps {args.total_timesteps}: one rollout takes {size}")
 
 
@@ -1100,7 +1112,7 @@ def run_name_of(args):
     name = args.run_name
     if name is None:
         usual = vars(default_args(args.env, args.recipe, args.quick))
-        usual.update(recipe="fast", quick=False)  # so that these two are named themselves
+        usual.update(recipe="fast", quick=False)  # other values of these two are in the name, too
         words = [hvae.environment_name(args.env)]
         for option, value in vars(args).items():
             if value != usual[option] and option not in ("seed", *FREE):
@@ -1119,7 +1131,8 @@ def claim_folder(args):
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
     # Two processes in one folder would mix their rows. The operating system ends a lock with its
-    # process, however that ends. Python would end it with the variable, so atexit holds on to it.
+    # process, however that ends. filelock also ends it as soon as no variable holds it any more, so
+    # it is handed to atexit. (is_singleton: within one process, claiming it twice is no conflict.)
     lock = FileLock(folder / ".lock", is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -1209,8 +1222,8 @@ class Log:
 
 def finish(folder, agent, phases, step, seconds):
     """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
-    # The last policy is forgotten; what is tested is the one that validation has selected. But for
-    # C.2, test actions are met here for the first time, and what they say changes nothing any more.
+    # The last policy is forgotten; what is tested is the one that validation has selected. Except
+    # in C.2, test actions are met here for the first time, and no decision depends on their scores.
     args = agent.args
     best = load(folder / "best.pt")
     put(best, folder, agent=agent)
@@ -1235,8 +1248,8 @@ def finish(folder, agent, phases, step, seconds):
 
 
 def plot_curve(folder, metric):
-    """C.7, Figure 14: scores over steps, as measured (published curves show the best so far)."""
-    # The distance between the two lines is what the policy has learned by heart.
+    """C.7, Figure 14: scores over steps, as measured ([code] draws the best score so far)."""
+    # With the same K, the distance between the two lines is what the policy has learned by heart.
     os.environ.pop("MPLBACKEND", None)  # one inherited from a notebook ends the import
     from matplotlib.figure import Figure  # not pyplot, which looks for a display
 
@@ -1282,7 +1295,7 @@ class EvaluateArgs:
     actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
     num_available: int | None = None  # K; None: as in the run's own test
     min_angle_gap: float | None = None  # CREATE: only tools at least this many degrees away
-    min_embedding_distance: float | None = None  # a share, .3: without the 30 % nearest to training
+    min_embedding_distance: float | None = None  # .3: without the 30 % nearest to training actions
     unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
     episodes: int = 5000  # episodes to play
     save: bool = False  # append the scores to evaluations.csv in the run's folder
@@ -1301,8 +1314,8 @@ def restrict_pool(options, module, table, pool, known):
         if share is not None and not 0 <= share <= 1:
             raise UserError(f"{share} is no share between 0 and 1")
     if far is not None:
-        # Distance to the nearest representation of a training action. [code] has limits in its
-        # units, which fit one encoder; a share of the pool means the same for all of them.
+        # Distance to the nearest representation of a training action. [code] has limits in units
+        # of this distance, which fit one encoder; a share of the pool fits all of them [here].
         distances = torch.cdist(table[pool].double(), table[known].double())  # (m, n)
         nearest = distances.amin(1).numpy()
         pool = pool[nearest >= np.quantile(nearest, far)]
