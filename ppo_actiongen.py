@@ -82,8 +82,8 @@ Distribution.set_default_validate_args(False)  # the checks cost as much as the 
 # An option of your own touches at most four places: a line in Args; the layer, if it needs one, in
 # Agent.__init__; its use, in Agent.act or ppo_loss; and, if you want to watch it, a number in the
 # dictionary that ppo_loss returns, which becomes a column of metrics.csv. (An option of an
-# environment: a line in Args and its name in OPTIONS.) Switched off, it must not make a layer: a
-# new layer draws random numbers, and every run would change.
+# environment: a line in Args, and its name in OPTIONS, far below.) Switched off, it must not make a
+# layer: a new layer draws random numbers, and every run would change.
 @dataclass
 class Args:
     """Train on training actions, select on validation actions, test on unseen ones."""
@@ -136,7 +136,7 @@ class Args:
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
-    published_init: bool = True  # initial weights of what chooses, places and stops as in [code]
+    published_init: bool = True  # gains of 0.01 and so on of [code]; off: see Agent.__init__
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . M s in place of an MLP [here]
     one_hot: bool = False  # integer states enter one-hot in place of as numbers [here]
@@ -173,7 +173,7 @@ TABLE_3 = {
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
-    # As in [code], which has 40 for stacking; they cannot tell checkpoints apart, so 200 [here].
+    # As in [code], but for stacking: 40 there cannot tell checkpoints apart, so 200 [here].
     "valid_episodes": (640, 160, 640, 200),
 }
 # Each column of the table, put over the defaults of Args, is the recipe of one environment.
@@ -196,7 +196,7 @@ FAST = {
         eval_available=50,  # tests keep the number of Table 3
         ent_floor=0.1,  # late in training a random skill mostly ends in the lava
         hidden_size=128,  # 64 units fit fewer skills
-        published_init=False,  # gradients below Adam's eps waste the first updates
+        published_init=False,  # with small weights learning starts late: see Agent.__init__
         total_timesteps=10_000_000,
     ),
     "recsys": dict(
@@ -211,7 +211,7 @@ FAST = {
     "create": dict(
         num_available=20,  # as in Grid World: other tools than the favourites are tried
         eval_available=50,  # tests keep the number of Table 3
-        small_pictures=True,  # a quarter of the cost; a background of 0 adds nothing
+        small_pictures=True,  # a quarter of the cost; white is 0 there, so empty places are silent
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
@@ -344,7 +344,7 @@ def cnn(frames, H, small):
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # many tools make all features larger, but only their places matter
+    if small:  # each tool makes all features larger, which means nothing
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -423,8 +423,8 @@ class Agent(nn.Module):
 
         # What chooses among the available actions. [code] starts all three layers of the utility
         # with a gain of 0.01. Gradients shrink on their way through them to about 1e-6, less than
-        # Adam's eps, so its steps are small and learning starts late. Without `published_init` only
-        # the last layer is small [here].
+        # Adam's eps (1e-5), so its steps are small and learning starts late. Without
+        # `published_init` only the last layer is small [here].
         project_gain, hidden_gain = (0.01, 0.01) if args.published_init else (1.0, 2**0.5)
         has_mlp = args.method == "utility" and not args.bilinear
         is_conditioned = args.aux_conditioned and "position" in self.action_parts
@@ -456,11 +456,11 @@ class Agent(nn.Module):
         """The layers behind alpha, or beta, of the Beta distribution over positions."""
         H = self.args.hidden_size
         dims = self.action_parts["position"].shape[0]
-        if not self.args.aux_conditioned:  # D.3.2: linear, from the encoding of the state
+        if not self.args.aux_conditioned:  # D.3.2: linear, from the state's encoding; gain 1 [code]
             return layer_init(nn.Linear(H, dims), 1.0)
         # C.4: two layers, from the state's encoding and the projected action (B, 2H). With a gain
-        # of 1 in the last one [code], each state has a favourite place before training; with 0.01
-        # all start alike [here].
+        # of 1 in the last one [code], each tool has its own favourite place before training; with
+        # 0.01 all start alike [here].
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -478,8 +478,8 @@ class Agent(nn.Module):
         if self.is_image:  # grey levels 0..255 -> 0..1
             encoding = self.encoder(state.float() / 255)
             return encoding, self.critic(encoding).squeeze(1)
-        # If the numbers of a state are ids of cells, a vector with a single 1 at its place says
-        # more than the number. All others are brought to mean 0 and standard deviation 1 [code].
+        # If the numbers of a state are ids of cells, a one-hot vector for each of them says more
+        # than the number. All others are brought to mean 0 and standard deviation 1 [code].
         if self.args.one_hot:
             number = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
             x = F.one_hot(number, len(self.cell_ids)).flatten(1).float()  # (B, cells * ids)
@@ -867,13 +867,14 @@ def train(args):
             if valid_score > best_score:
                 best_score = valid_score
                 best = dict(args=vars(args), step=step, agent=agent.state_dict())
+                # hvae.write: the whole file or nothing, even if the process is killed meanwhile.
                 hvae.write(folder / "best.pt", partial(torch.save, best))
 
         # Record what happened (under torchrun: to the environments of rank 0).
-        lasted = time.perf_counter() - started
+        lasted = time.perf_counter() - started  # with the evaluation, if there was one
         seconds += lasted
         score, total, length = episode_means(episodes)
-        row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)  # sps: steps per second
+        row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)
         row.update(train_score=train_score, valid_score=valid_score, learning_rate=learning_rate)
         row.update(episode_score=score, episode_return=total, episode_length=length, **numbers)
         # CleanRL's 1 - var(return - value) / var(return): their difference is the advantage.
@@ -1059,8 +1060,9 @@ def start_from(agent, folder):
         if there != getattr(agent.args, name):
             raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
     if agent.args.method == "nearest-neighbor":
-        # Its outputs are actions, so they start anew; [code] does so with the stop head, too.
-        # By their names in the dictionary of weights, the old ones are replaced by untrained ones.
+        # Its outputs are the old actions, so this layer starts anew; the stop head of this baseline
+        # does so as well [code], for no known reason. The loaded weights of these layers are
+        # replaced by this agent's untrained ones.
         own = agent.state_dict()
         anew = [name for name in own if name.startswith(("head.", "fc_stop."))]
         theirs["agent"].update({name: own[name] for name in anew})
@@ -1112,7 +1114,7 @@ def run_name_of(args):
     name = args.run_name
     if name is None:
         usual = vars(default_args(args.env, args.recipe, args.quick))
-        usual.update(recipe="fast", quick=False)  # other values of these two are in the name, too
+        usual.update(recipe="fast", quick=False)  # else these two would equal the run's own
         words = [hvae.environment_name(args.env)]
         for option, value in vars(args).items():
             if value != usual[option] and option not in ("seed", *FREE):
