@@ -140,7 +140,7 @@ class Args:
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . M s in place of an MLP [here]
     one_hot: bool = False  # integer states enter one-hot in place of as numbers [here]
-    small_pictures: bool = False  # half the size, white on black, three convolutions [here]
+    small_pictures: bool = False  # half the size, inverted, three convolutions [here]
 
     # --- evaluation ---
     eval_every: int = 409_600  # steps between two evaluations
@@ -169,7 +169,7 @@ TABLE_3 = {
     "task": (None, None, "push", None),
     "placement": (None, None, None, "1d"),
     # D.2: the rate falls linearly over the training. [code] agrees for two of the environments. For
-    # the others it takes longer than the run, so their rates end at .46 and .97 of the first one.
+    # the others it takes longer than the run, so theirs end at .46 and .97 of the initial rate.
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
@@ -211,7 +211,7 @@ FAST = {
     "create": dict(
         num_available=20,  # as in Grid World: other tools than the favourites are tried
         eval_available=50,  # tests keep the number of Table 3
-        small_pictures=True,  # a quarter of the cost; white is 0 there, so empty places are silent
+        small_pictures=True,  # a quarter of the cost; empty places are 0 there, not 255
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
@@ -340,11 +340,12 @@ def cnn(frames, H, small):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
         # [code] keeps PyTorch's initial weights. They are so small that all pictures have nearly
         # the same features at first, and a run of a few million steps loses time over it [here].
+        # (--small-pictures is the only option that changes the convolutions.)
         if small:
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # each tool makes all features larger, which means nothing
+    if small:  # every tool scales all features up; that common factor says little, so it goes
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -575,7 +576,9 @@ class Agent(nn.Module):
         if self.args.method == "continuous":
             # D numbers were drawn. [code] adds up their entropies in Grid World and averages them
             # elsewhere; [here] the mean, so that ent_coef means the same for every D.
-            logprob = logprob.sum(1).clamp(-1e5, 1e5)  # [code]: -inf minus -inf is NaN
+            # With a tiny standard deviation the sum can be -inf, and the difference of two of them,
+            # in ppo_loss, NaN; hence the limits [code].
+            logprob = logprob.sum(1).clamp(-1e5, 1e5)
             entropy = entropy.mean(1)
 
         # Where to place it: a Beta distribution for each dimension (D.3.2). With parameters above 1
@@ -614,9 +617,9 @@ class Agent(nn.Module):
 @torch.no_grad()
 def play_step(envs, obs, agent):
     """One action in each of N environments: the transition, the next observation, the infos."""
-    # The environment wants the number of an available action, 0..K-1, and the other parts.
     state, available = agent.to_tensors(obs)
     action, logprob, _, value = agent.act(state, available)
+    # The environment wants the number of an available action, 0..K-1, and the other parts.
     executed = action["choice"].cpu().numpy()  # (N,)
     if agent.action_parts:
         executed = {name: action[name].cpu().numpy() for name in agent.action_parts}
@@ -840,9 +843,9 @@ def train(args):
         batch["advantage"] = gae(rewards, batch["value"], batch["done"], next_value, args.gamma)
         batch["return"] = batch["advantage"] + batch["value"]
 
-        # Learn. The statistics of the states follow afterwards, because the policy that learns has
-        # to be the one that collected. While fine-tuning they stay as they were [code]: the layers
-        # that were taken over expect just these units.
+        # Learn. The statistics of the states follow afterwards: with new ones every probability
+        # would change, and the ratio in ppo_loss would not start at 1. While fine-tuning they stay
+        # as they were [code]: the layers that were taken over expect just these units.
         numbers = update(agent, optimizer, batch, ent_coef)
         if not (agent.is_image or args.one_hot or args.finetune):
             agent.obs_stats.update(batch["state"].flatten(0, 1))
