@@ -112,11 +112,10 @@ TABLE = {
     "create-push": rows(f"{CREATE} --task push", METHODS | INPUTS | NUMBERS),
     "create-seesaw": rows(f"{CREATE} --task seesaw", METHODS | INPUTS | ENGINEERED | NUMBERS),
     "create-obstacle": rows(f"{CREATE} --task obstacle", METHODS | INPUTS | NUMBERS),
-    "stacking": rows("stacking", METHODS | ENGINEERED)
-    | {"ours_linear_path": "stacking --representation {fig6/ours_linear_path}"},
+    "stacking": rows("stacking", METHODS | ENGINEERED),
     "fig4": rows("hvae gridworld", ENCODERS | ONE_HOT | LINEAR),
     "fig5": rows("hvae create", ENCODERS | INPUTS | FULL_SPLIT),
-    "fig6": rows("hvae stacking", ENCODERS | FULL_SPLIT | LINEAR),
+    "fig6": rows("hvae stacking", ENCODERS | FULL_SPLIT),
     "fig8": rows(f"{CREATE} --task TASK", FIGURE_8, NINE),
     "fig9": {},  # below
     "fig10": rows(f"{CREATE} --task TASK", SUBGOAL, TASKS),

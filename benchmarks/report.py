@@ -109,25 +109,9 @@ def published(figure: str, place: Place, method: str, phase: str) -> tuple:
         if figure == "analysis-embedding":  # by rank: distances 0.5 .. 5 of another table
             phase = f"{5 * float(phase) + 0.5:.1f}"
     found = PUBLISHED.get((env, task, method, phase))
-    if found is None and method == "ours_conditioned_auxiliary":  # without this head: see `notes`
+    if found is None and method == "ours_conditioned_auxiliary":  # without this head
         found = PUBLISHED.get((env, task, "ours", phase))
     return found or (None, None)
-
-
-def notes(figure: str, rows: list[dict]) -> list[str]:
-    """What has to be said of a comparison with published scores of policies, below a table."""
-    fast = [row for row in rows if row["env"] == "create" and row["recipe"] == "fast"]
-    some = {row["method"] for row in fast if row["steps"]}
-    text = []
-    if some - {"ours_conditioned_auxiliary"} and figure not in ("fig11", *ANALYSES):
-        link = "[the position of C.4](README.md#create)"
-        text.append(f"CREATE: every row has {link}, most published scores do not.")
-    if "nearest_neighbor" in some:
-        text.append(
-            "CREATE, nearest neighbour: the published test numbered the training tools in another "
-            "order than the training had, so its score may be an artefact."
-        )
-    return text
 
 
 def tested(phase: str) -> float:
@@ -349,8 +333,7 @@ def section(name: str, draw: bool) -> str:
         picture()
     pictures = [path, *sorted(RESULTS.glob(f"{name}-tsne-*.png"))]
     images = [f"![{p.stem}]({p.name})" for p in pictures if p.exists()]
-    remarks = notes(figure, rows) if text else []
-    return "\n\n".join(filter(None, [text, *remarks, *images])) + "\n"
+    return "\n\n".join(filter(None, [text, *images])) + "\n"
 
 
 def main(check: bool = False) -> None:

@@ -527,16 +527,6 @@ def test_every_class_has_its_own_look(colour):
     assert len(looks) == len(KINDS) - 1
 
 
-def test_pictures_show_scene_and_state_side_by_side():
-    env = fixed_env("push", find_tool("Cannon"), render_mode="rgb_array")
-    assert len(env.render_frames()) == 1
-    state = env.step({"choice": 1, "position": (-0.3, 0.6)})[0]["state"]
-    frames = env.render_frames()
-    assert len(frames) == 5 and np.array_equal(frames[-1], env.render())
-    assert frames[0].shape == (450, 420 + 6 + 140, 3) and not np.array_equal(frames[0], frames[-1])
-    assert np.abs(frames[-1][:420, -140:, 0].mean() - state.mean()) < 1
-
-
 def test_the_no_op_and_k_minus_1_tools_are_available():
     pool = c.split_actions()["valid"]
     env, seen = CreateEnv(pool, 50), set()

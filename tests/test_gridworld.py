@@ -269,19 +269,7 @@ def test_layouts_and_available_sets_are_uniform():
         assert abs(chi_squared - freedom) < 5 * (2 * freedom) ** 0.5
 
 
-def test_what_an_observation_holds_is_the_callers():
-    env = GridWorldEnv()
-    first, _ = env.reset(seed=0)
-    first["available"][:] = first["state"][:] = 0
-    second, *_ = env.step(0)
-    assert len(set(second["available"])) == 50 and second["state"][0] == 2
-
-
 def test_bad_input():
-    with pytest.raises(ValueError, match="'human'.*'rgb_array'"):
-        GridWorldEnv(render_mode="human")
-    with pytest.raises(ValueError, match="'video'.*xy.*onehot"):
-        action_observations([0], 1, "video")
     env = GridWorldEnv()
     env.reset(seed=0, options={"layout": np.int64(7)})
     for layout in (42, -1):  # and the episode goes on

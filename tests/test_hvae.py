@@ -303,14 +303,6 @@ def test_missing_package_is_one_sentence_an_environments_error_is_not(tmp_path, 
     refused("^Shape Stacking needs pybullet$", hvae.load_environment, "stacking")
 
 
-@pytest.mark.parametrize("held_out", [[], [3], [3, 5, 7]])
-def test_few_held_out_actions_are_no_reason_to_fail(tmp_path, monkeypatch, held_out):
-    split = dict(train=np.arange(8, 1024, 5), valid=held_out, test=[])
-    monkeypatch.setattr(gridworld, "split_actions", lambda name, seed: split)
-    path = hvae.train(tiny(runs_dir=str(tmp_path)))
-    assert path.with_name(f"{path.stem}-tsne.png").exists() == (len(held_out) == 3)
-
-
 def test_probe_of_ground_truth_and_of_noise():
     features = gridworld.engineered_representations()
     tables = features, features[:, :2], np.random.default_rng(0).normal(size=(1024, 16))

@@ -340,15 +340,6 @@ def test_a_shape_is_let_go_at_its_place_just_above_everything(placement, dims, m
     env.close()
 
 
-def test_bad_arguments_are_refused():
-    for bad in ({"num_observations": 0}, {"workers": 0}, {"seed": -1}):
-        with pytest.raises(ValueError):
-            stacking_env.action_observations([1], **{"num_observations": 2} | bad)
-    for bad in ({"placement": "3d"}, {"render_mode": "human"}):
-        with pytest.raises(ValueError, match=str(*bad.values())):
-            stacking_env.make_vec(1, **bad)
-
-
 def test_bad_actions_are_refused_and_leave_no_trace(env):
     env.reset(seed=8)
     before = env.poses()
@@ -365,7 +356,6 @@ def test_bad_actions_are_refused_and_leave_no_trace(env):
     assert not truncated and len(env.shape_ids) == 3 and env._steps == 1
 
 
-# ---- interfaces ----
 def test_copies_are_refused_and_nobody_ends_anothers_simulation(env):
     env.reset(seed=0)
     for duplicate in (copy.copy, copy.deepcopy, pickle.dumps):
