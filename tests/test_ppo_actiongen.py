@@ -663,7 +663,7 @@ JOINT = """import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
 import torch.distributed as dist, ppo_actiongen as ppo, test_ppo_actiongen as test
 dist.init_process_group("gloo")
 test.torch.save(test.joint_update(ppo.RANK, ppo.WORLD_SIZE), {folder!r} + f"/{{ppo.RANK}}")
-dist.destroy_process_group()
+dist.barrier(); dist.destroy_process_group()
 """
 
 
