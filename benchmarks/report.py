@@ -159,7 +159,8 @@ def table(figure: str, cells: Cells) -> str:
     """One row per environment and method, one column per phase; published means in brackets."""
     phases = dict.fromkeys(phase for cell in cells.values() for phase in cell)
     phases = sorted(phases, key=lambda phase: [*HEADS, phase].index(phase))  # seen, unseen, others
-    named = figure == "main" or len({place[:2] for place, _ in cells}) > 1
+    tasks = {place[:2] for place, _ in cells}
+    named = figure == "main" or len(tasks) > 1 or any("," in task for _, task in tasks)
     lines = []
     for (place, method), cell in cells.items():
         line = [*names(place, method), str(max(map(len, cell.values())))]
