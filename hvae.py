@@ -610,7 +610,7 @@ def source_hash(module):
 
 
 def observe(module, ids, args):
-    # Raw observations (len(ids), N, ...), recorded once for all encoders.
+    """Raw observations (len(ids), N, ...), recorded once for all encoders."""
     N = args.observations
     kind = f"{environment_name(args.env)}-{args.modality}-{N}"
     source = source_hash(module)
@@ -640,7 +640,7 @@ def observe(module, ids, args):
 
 
 def fit(model, data, rows, args):
-    # Maximise the objective on data[rows]; return the losses of every update, a list of dicts.
+    """Maximise the objective on data[rows]; return the losses of every update, a list of dicts."""
     # Log-variances that are parameters, by their name, have a learning rate of their own.
     groups = []
     for name, parameter in model.named_parameters():
@@ -678,7 +678,7 @@ def fit(model, data, rows, args):
 
 @torch.no_grad()
 def embed(model, data, ids, args):
-    # The table (NUM_ACTIONS, C): each action's representation, from all of its observations.
+    """The table (NUM_ACTIONS, C): each action's representation, from all of its observations."""
     model.eval()  # running statistics: a representation does not depend on its neighbours
     table = np.zeros((load_environment(args.env).NUM_ACTIONS, args.representation_size), np.float32)
     for action, raw in zip(tqdm(ids, "encoding", disable=None), data, strict=True):
