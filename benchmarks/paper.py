@@ -101,7 +101,6 @@ def vary(flag: str, *values) -> dict[str, str]:
 TABLE = {
     "quick": {  # the README's first commands
         "gridworld/ours": "gridworld --quick",
-        "gridworld/engineered": "gridworld --quick --representation engineered",
         "recsys/ours_bilinear": "recsys --quick --bilinear",
         "create/ours": f"{CREATE} --quick",
         "stacking/ours": "stacking --quick",

@@ -67,9 +67,9 @@ ENVIRONMENTS = {  # title, what a score is
 # exact search; all but 1 in 7,000 sets of skills allow a path. Recommender: greedy play by a policy
 # that is told the user, but not the popularity of unseen products (unless it is in the vector).
 CEILINGS = {"gridworld": 1.0, "recsys": 0.301, "recsys_full": 0.659}
-ANALYSES = {  # figure -> its name in published_analyses.csv, what is varied
+ANALYSES = {  # figure -> its name in published_analyses.csv ("": in other units), what is varied
     "analysis-angle": ("angle", "least angle to a training tool, degrees"),
-    "analysis-embedding": ("emb", "share of near tools left out"),
+    "analysis-embedding": ("", "share of near tools left out"),
     "analysis-unseen-ratio": ("ratio", "share of unseen tools available"),
     "analysis-set-size": ("action_set_size", "available tools"),
 }
@@ -96,7 +96,7 @@ def rows_of(figure: str) -> list[dict]:
     rows = read(RESULTS / f"{figure}.csv")
     for row in rows:
         if row.get("split") == "random":
-            row["task"] += ", random split"
+            row["task"] = f"{row['task']}, random split".removeprefix(", ")
         METHODS.setdefault(row["method"], (row["method"], "grey"))  # your own
     return rows
 
@@ -106,8 +106,6 @@ def published(figure: str, place: Place, method: str, phase: str) -> tuple:
     env, task = place[0], place[1].split(",")[0]
     if figure in ANALYSES:
         env, phase = ANALYSES[figure][0], phase.split("=")[1]
-        if figure == "analysis-embedding":  # by rank: distances 0.5 .. 5 of another table
-            phase = f"{5 * float(phase) + 0.5:.1f}"
     found = PUBLISHED.get((env, task, method, phase))
     if found is None and method == "ours_conditioned_auxiliary":  # without this head
         found = PUBLISHED.get((env, task, "ours", phase))
@@ -148,6 +146,8 @@ def names(place: Place, method: str) -> tuple[str, str, str]:
     label = METHODS[method][0]
     if env.startswith("recsys"):  # no encoder: its representations are given
         label = label.replace("HVAE + u", "U")
+    if not steps:  # an encoder alone
+        label = label.replace(" + utility", "")
     millions = round(steps / 1e6, 2 if steps < 1e7 else 0)
     return f"{ENVIRONMENTS[env][0]} {task}".strip(), label, f"{millions:g}M" if steps else ""
 
@@ -160,7 +160,7 @@ def table(figure: str, cells: Cells) -> str:
     phases = dict.fromkeys(phase for cell in cells.values() for phase in cell)
     phases = sorted(phases, key=lambda phase: [*HEADS, phase].index(phase))  # seen, unseen, others
     tasks = {place[:2] for place, _ in cells}
-    named = figure == "main" or len(tasks) > 1 or any("," in task for _, task in tasks)
+    named = figure in ("main", *ANALYSES) or len(tasks) > 1 or "random" in str(tasks)
     lines = []
     for (place, method), cell in cells.items():
         line = [*names(place, method), str(max(map(len, cell.values())))]
@@ -317,7 +317,7 @@ def section(name: str, draw: bool) -> str:
         curves = group(rows_of("fig9_curves"), "step", "episode_score")
         curves = {key: points for key, points in curves.items() if key[0] in zero}
         picture = partial(draw_lines, path, lines_of(name, curves, zero), "million steps")
-        text = "Success with unseen actions over steps of training on them."
+        text = "Score with unseen actions over steps of training on them."
     elif name in ANALYSES:
         text = table(name, group(rows, every=True))
         picture = partial(draw_lines, path, lines_of(name, group(rows), {}), ANALYSES[name][1])
