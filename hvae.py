@@ -2,37 +2,38 @@
 
 An action is known only by observations of what it does: a set X = {x_1 .. x_n} of trajectories,
 videos or pictures. One latent c explains what the set shares (the action), a latent z_j what is
-special to x_j (a ball's launch, a camera angle). Its first state s_j is given (a picture has none).
+special to x_j (a ball's launch, a camera angle). The first state s_j of x_j is not predicted but
+given to the decoder (a picture has none). With a draw of c ~ q(c | X), z_j ~ q(z_j | x_j, c):
 
         c ~ N(0, I)  ->  z_j ~ p(z | c)  ->  x_j ~ p(x | z_j, c, s_j)
     ELBO per observation = mean_j [ log p(x_j | z_j, c, s_j) - KL(q(z_j | x_j, c) || p(z_j | c)) ]
                            - KL(q(c | X) || N(0, I)) / |X|
 
-Only recipe paper uses this weight of the last term; quick and fast divide it by more than |X|
-(`kl_c_divisor`), a smaller weight as in a beta-VAE. The representation of an action is the mean of
-q(c | X). The networks learn from training actions and CREATE's no-op only (those of the oracle
-encoder from all actions). Then every action of the split and the no-op are encoded, without
-re-training: a table, one row per action. Actions in no part of the split keep a row of zeros.
+Only `--recipe paper` uses this weight of the last term; the shorter recipes, quick and fast, divide
+it by more than |X| (`kl_c_divisor`). The representation of an action is the mean of q(c | X). The
+networks learn from training actions and CREATE's no-op (the oracle encoder's from all of the
+split), and the last update's weights count. Then every action of the split and the no-op are
+encoded, without re-training: a table, one row per action. Actions in no part keep a row of zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
-    python hvae.py gridworld --train-on all      # the oracle encoder: trained on all actions
+    python hvae.py gridworld --train-on all      # the oracle encoder: trained on all parts
     python hvae.py create --modality video       # B: videos; B's Full Split: --split full
-    python hvae.py gridworld --recipe paper      # Tables 3-4: days on a CPU; --help: its numbers
+    python hvae.py gridworld --recipe paper      # Tables 3-4: days on a CPU; add --help: numbers
     python hvae.py my_env.py                     # an environment of your own, in a file
 
 Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed SPLITS (names),
 NO_OP (an id), UNITS (see `prepare`); and
 
     split_actions(split, seed) -> {"train": ids, "valid": ids, "test": ids}
-    action_labels() -> (NUM_ACTIONS,); engineered_representations() -> (NUM_ACTIONS, D)
+    action_labels() -> (NUM_ACTIONS,); engineered_representations() -> (NUM_ACTIONS, D), known facts
     action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
 An observation is (L, F), L states of F numbers each; but of modality "onehot" (L, 2), a cell's x
-and y as whole numbers 0-79; of "image" (S, S), "video" (L, S, S), greys 0-255, S 48 or 84. Random
-numbers must depend on seed *and* id, for actions are recorded in several calls.
-Marks in the comments: "appendix:" quotes the paper where sources differ; [code] is the authors'
-released implementation; [here] is this repository's choice, with its reason.
+and y as whole numbers 0-79, at most 39 from the first; of "image" (S, S), "video" (L, S, S), greys
+0-255, S 48 or 84. Random numbers must depend on seed *and* id: there are several calls, each with
+`workers` processes. Marks: "appendix:" is that of Generalization to New Actions in Reinforcement
+Learning (ICML 2020); [code] is the authors' program; [here] our choice, with its reason.
 """
 
 import hashlib
@@ -54,12 +55,12 @@ from tqdm import tqdm
 
 # Paper map: D.2 (Tables 3-4) -> Args, HYPERPARAMETERS; D.3.1 -> the networks, in its order; D.3.1's
 # loss -> ObservationModel.forward; B -> prepare, HVAE, VAE; D.1 -> fit; Figures 4-6 -> plot_tsne.
-# Table 4's "MLP hidden layers 3" is no option: D.3.1 gives each MLP its depth; the code follows.
+# Table 4's "MLP hidden layers 3" is no option: D.3.1 gives each MLP its own depth.
 # Shapes: A actions in a batch, N recorded observations of each, n in an update, B = A * n; L states
 # of F numbers per trajectory, the first given, T = L - 1 predicted; C = Z sizes of c, z; H hidden
 # width; E of an encoded observation: H, or H + L * F with the linear path; S side of a picture.
 
-# Name on the command line -> module. (The Recommender has nothing to record, so no encoder.)
+# Name on the command line -> module. (The Recommender has nothing to encode: here for its tables.)
 ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
@@ -73,10 +74,10 @@ class Args:
     """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
 
     env: Annotated[str, tyro.conf.Positional]  # gridworld, create, stacking, or a file: my_env.py
-    modality: str  # gridworld: xy, onehot; create: state (six numbers), xy, video; stacking: image
+    modality: str  # gridworld: xy, onehot; create: state [code], xy (B), video; stacking: image
     recipe: Literal[RECIPES]  # which column of HYPERPARAMETERS gives the numbers
     hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline (B)
-    train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, sees held-out actions
+    train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, on all parts
     linear_path: bool = False  # the mean of c (VAE: of z) has a linear part (not the paper's)
     split: str = "default"  # name of the split of the actions: default, full, ...
     split_seed: int = 0  # seed of the split
@@ -93,18 +94,18 @@ class Args:
     observations: int  # recorded of each action; its representation comes from all of them
     batch_observations: int  # observations of each action in an update
     kl_c_divisor: int  # divides KL(q(c|X) || N(0, I)); in the ELBO: batch_observations
-    relative: bool  # trajectories (not pictures, videos) relative to their first state
+    relative: bool  # trajectories: moves are read, later states predicted from the first one
     kl_warmup: float = 0.0  # share of the updates in which the weight of the KLs climbs to 1
     compact_lstm: bool  # a Bi-LSTM of half the width, directions concatenated (none in pictures)
-    log_var_start: float | None  # first log-variance of the decoder (None: drawn from N(0, 1))
-    log_var_rate: float  # factor on the learning rate of log-variances that are parameters
+    log_var_start: float | None  # initial log-variance of the decoder (None: from N(0, 1))
+    log_var_rate: float  # factor on the learning rate of learned log-variances (all but q(c|X)'s)
 
 
 # ---- Tables 3 and 4 ----
 
-# Args explains the rows. "paper" has the tables' numbers; "fast", the default, takes minutes on a
-# CPU, more for pictures; "quick" is a first try. Counts and rates of these two are [here]: tried by
-# hand, judged by the scores of `probe` on held-out actions.
+# Args explains the rows. "paper" has the tables' numbers, but for `hidden` of pictures; "fast", the
+# default, takes minutes on a CPU, more for pictures; "quick" is a first try. Counts and rates of
+# these two are [here]: tried by hand, judged by `probe` (on validation and test actions together).
 # fmt: off
 HYPERPARAMETERS = {  # columns: quick, fast, paper
     "representation_size": (16,    16,    16),      # Table 3
@@ -116,7 +117,7 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     "q_hidden":            (128,   128,   128),     # Table 4
     "observations":        (64,    1024,  1024),    # Table 4
     # Observations of one action differ little: many small updates teach more than few large ones.
-    # appendix: 1,024 (recorded or used?); [code] 45 to 672; [here] "paper" uses all, in 11 GB.
+    # appendix: 1,024 (recorded or used?); [code] 45 to 672, by environment; [here] "paper": all.
     "batch_observations":  (4,     4,     1024),
     # With the ELBO's divisor, 4, only 4 of 16 dimensions of c stayed in use. 64: tried by hand.
     "kl_c_divisor":        (64,    64,    1024),
@@ -126,16 +127,16 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     # A Bi-LSTM of half the width has a quarter of the weights and 0.6 of the time of an update.
     "compact_lstm":        (True,  True,  False),
     # RAdam moves a parameter by about the learning rate per update at most: 1e-3 is too slow for a
-    # log-variance that starts near 0 and has to fall to the clamp at -4 (see forward).
+    # log-variance that starts near 0 and has to fall to the clamp at -4 (ObservationModel.forward).
     "log_var_start":       (-2.0,  -2.0,  None),
     "log_var_rate":        (10.0,  10.0,  1.0),
 }
-# Rows above are replaced by the modality's or, if it has none, the environment's: never by both.
+# Rows above, or defaults, are replaced by the modality's; if it has none, the environment's.
 EXCEPTIONS = {
     # 160 zeros and ones say the same as 2 numbers, but it takes longer to learn what they mean.
     "onehot": {"updates": (2_000, 4_000, 0)},
     # Without these changes the model ignored z (how the ball was launched): the squared error, in
-    # steps of UNITS, stayed near 6.5; with all of them it is below 1. Not tested one by one.
+    # units of `step` (see prepare), stayed near 6.5; with all of them below 1. Not tried singly.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
@@ -161,11 +162,11 @@ EXCEPTIONS = {
     },
 }
 # appendix: Tables 3-4 have one column for all of CREATE; [code] its videos have the numbers of
-# Shape Stacking's pictures; [here] as the code. 1,024 videos of every tool are 28 GB.
+# Shape Stacking's pictures; [here] as the code. 1,024 videos of every tool are 35 GB.
 EXCEPTIONS["video"] = EXCEPTIONS["image"] | {
         "updates":             (200,   600,   0),
         "observations":        (16,    128,   1024),
-        "linear_path":         (False, False, False),
+        "linear_path":         (False, False, False),   # not tried here
 }
 # fmt: on
 
@@ -245,9 +246,9 @@ def prepare(raw, args):
         return one_hot.flatten(2).float(), later.long()
     if not args.relative:
         return raw, later
-    # UNITS: first states become (x - centre) / half_width, moves move / step. `step` should be such
-    # that two actions differ by more than 0.135 steps: the decoder's log-variance is clamped at -4
-    # (see forward), so its sigma is at least exp(-4 / 2) = 0.135.
+    # UNITS, a dictionary: first states become (x - centre) / half_width; all else is divided by
+    # `step`. Two actions should differ by more than 0.135 steps: the decoder's log-variance is
+    # clamped at -4 (ObservationModel.forward), so its sigma is at least exp(-4 / 2) = 0.135.
     units = getattr(load_environment(args.env), "UNITS", dict(centre=0, half_width=1, step=1))
     start = (first - units["centre"]) / units["half_width"]
     return torch.cat([start, moves / units["step"]], 1), (later - first) / units["step"]
@@ -285,8 +286,8 @@ class SumReLU(nn.Module):
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
-    # D.3.1: "1D batch-norm"; [code] this, also epsilon and momentum. A norm per dimension would
-    # stretch an unused dimension of c to variance 1; beside the others it can stay near 0 (KL 0).
+    # D.3.1: "1D batch-norm"; [code] this, also epsilon and momentum. A norm per dimension stretches
+    # an unused dimension of c to variance 1 at first; a shared one lets it stay near 0 (KL 0).
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
@@ -295,7 +296,7 @@ class GlobalBatchNorm(nn.BatchNorm1d):
 
 
 def normal(mean, log_var):
-    # A diagonal Gaussian. PyTorch does not check it, to save time; `check_table` does in the end.
+    # A diagonal Gaussian. PyTorch looks for no NaN here, to save time; `check_table` does later.
     return Normal(mean, (0.5 * log_var).exp(), validate_args=False)
 
 
@@ -339,7 +340,7 @@ class TrajectoryEncoder(nn.Module):
 
     def forward(self, x):
         h = self.lstm(x)[0].mean(1)  # (B, 2 * width): forward half, backward half
-        return h.unflatten(1, (-1, self.hidden)).mean(1)  # (B, 2, H), compact (B, 1, H)
+        return h.unflatten(1, (-1, self.hidden)).mean(1)  # (B, 2 or, compact, 1, H) -> (B, H)
 
 
 class ActionInference(nn.Module):
@@ -355,7 +356,7 @@ class ActionInference(nn.Module):
         self.norm = GlobalBatchNorm()  # [code] over mean and log-variance together
 
     def forward(self, h):
-        # The mean over a set does not depend on the order of its observations, or on their number.
+        # A mean depends on no order, and its size on no number: 4 in training, 1,024 at the end.
         pooled = self.before(h).mean(1)  # (A, n, H) -> (A, H)
         return normal(*self.norm(self.after(pooled)).chunk(2, -1))  # (A, 2C) -> twice (A, C)
 
@@ -363,15 +364,15 @@ class ActionInference(nn.Module):
 class ObservationInference(nn.Module):
     """Observation Inference Network: encoded x (B, E), c (B, C) -> q(z | x, c), Gaussian (B, Z)."""
 
-    # [code] The batch norm; p(z | c), the same network without x; the VAE's q(z | x), without c.
+    # Only in [code]: the batch norm; p(z | c), by the same network without x. VAE: q(z | x), no c.
     def __init__(self, inputs, hidden, size):
         super().__init__()
         self.sum = SumReLU(inputs, hidden)
         self.layers = nn.Sequential(
             Residual(hidden, 2), Residual(hidden, 2), nn.Linear(hidden, size), GlobalBatchNorm()
         )
-        # appendix: networks output the log-variances of q(z|x,c), p(z|c) and the decoder; [code]
-        # learned constants, from N(0, 1); [here] as the code, which made the results.
+        # appendix: networks output the log-variances of q(z|x,c) and the decoder; [code] learned
+        # constants, from N(0, 1), of p(z|c), too; [here] as the code, which made the results.
         self.log_var = nn.Parameter(torch.randn(size))
 
     def forward(self, *inputs):
@@ -420,8 +421,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0 is the picture, 1 its mask (see decode). A grey picture is everywhere worse than
-        # the first frame, dark on white: the mask would go to 0. [here] So it starts at .95, white.
+        # Channel 0 is the picture, 1 its mask (see decode). Frames are dark on white: grey is worse
+        # than the first frame, and the mask would fall to 0. [here] So it starts white, at .95.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -438,7 +439,7 @@ class ObservationModel(nn.Module):
         self.args = args
         features = shape[-1]  # F, of trajectories; other modalities correct these numbers below
         steps = shape[0] - 1  # T
-        sigmas = features  # the decoder's log-variances: one per number or pixel, for all T steps
+        sigmas = features  # shape of the decoder's log-variances: per number or pixel, for all T
         if args.modality == "onehot":
             features = CLASSES * shape[-1]
         if args.modality in VISUAL:
@@ -448,7 +449,7 @@ class ObservationModel(nn.Module):
             self.conv_decoder = conv_decoder(shape[-1], args.modality == "video")
             self.to(memory_format=torch.channels_last)  # [here] 1.4 times as fast on a CPU
         if args.modality == "image":
-            # appendix: Bi-LSTM for trajectories only; [code] pictures, too; [here] as the appendix.
+            # appendix: Bi-LSTM for trajectories only; [code] pictures, too; [here] a linear layer.
             steps = 0
             self.sequence = nn.Sequential(nn.Flatten(), nn.Linear(features, args.hidden), nn.ReLU())
         else:
@@ -467,7 +468,7 @@ class ObservationModel(nn.Module):
             self.path = nn.Linear(self.encoded_size, args.representation_size)
 
     def encode(self, x):
-        # Inputs of `prepare` -> start (B, F), for the decoder; encoded observations (B, E).
+        # What `prepare` returns first -> start (B, F), for the decoder; encoded ones (B, E).
         if self.args.modality in VISUAL:
             features = self.conv(x.flatten(0, 1))  # (B * L, 1, S, S) -> (B * L, 288)
             x = features.unflatten(0, x.shape[:2])  # (B, L, 288)
@@ -478,8 +479,7 @@ class ObservationModel(nn.Module):
 
     def add_linear_path(self, q, h):
         # [here] The mean of c (VAE: of z) = Linear(h, averaged over the set) + 0.1 * q.mean. The
-        # deep part counts a tenth; the rest is a linear read-out of h, which cannot fit each
-        # training action by itself. That c does not collapse then was found by trying, 0.1, too.
+        # deep part counts a tenth. Why c does not collapse then is not known: found by trying.
         if self.path:
             q = Normal(self.path(h) + 0.1 * q.mean, q.stddev, validate_args=False)
         return q
@@ -605,7 +605,7 @@ def short_hash(data):
 
 
 def source_hash(module):
-    # Has the file changed in any way? Then recordings are made anew; of a table there is a note.
+    # Has the file changed in any way? Then recordings are made anew; an old table prints a note.
     return short_hash(Path(module.__file__).read_bytes())
 
 
@@ -618,7 +618,7 @@ def observe(module, ids, args):
     workers = os.cpu_count() or 1
 
     def pieces():
-        # All pictures do not fit in memory: first the header of a .npy file, then 128 actions at a
+        # Not all pictures fit in memory: first the header of a .npy file, then 128 actions at a
         # time. Always seed 0: encoders differ by their seed, not by their data.
         for i in tqdm(range(0, len(ids), 128), "recording", disable=None):
             data = module.action_observations(ids[i : i + 128], N, args.modality, 0, workers)
@@ -809,12 +809,12 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     # 0.970, 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
     scores = {}
     if environment_name(env) == "gridworld":
-        net = features[:, :2]  # columns 0-1 are the net displacement (x, y), each in -5..5
+        net = features[:, :2]  # [code] columns 0-1: net displacement (x, y), -5..5
         logistic = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000))
         scores["net_r2"] = score(ridge, net)
         scores["move_accuracy"] = np.mean([score(logistic, m) for m in module.SKILL_MOVES.T])
         scores["nn_net_match"] = score(KNeighborsClassifier(1), net @ [100, 1])  # class per (x, y)
-    # Of all actions: the share whose nearest other held-out action has the same label, as the eye
+    # Everywhere: the share of held-out actions whose nearest other has the same label, as the eye
     # sees it in Figures 4-6. By chance: the share of pairs with equal labels.
     labels = np.asarray(module.action_labels())[held_out_ids]
     others = NearestNeighbors(n_neighbors=1).fit(mean[held_out_ids])

@@ -1,9 +1,9 @@
 """PPO with a policy over changing sets of actions: train, validate, test on unseen actions.
 
 An ordinary policy has one output per action, so it cannot use an action it was not trained with.
-This one reads a *representation* c_i of every action, a vector that hvae.py makes from recordings
-of what the action does. A utility function f_nu gives one number to a pair of state and action, and
-a softmax turns the numbers of the available actions into probabilities:
+This one reads a *representation* c_i of every action, a vector that hvae.py (a hierarchical VAE)
+makes from recordings of what the action does. A utility function f_nu gives one number to an action
+and an encoded state f_omega(s); softmax turns those of the available actions into probabilities:
 
     pi(a_i | s) = exp f_nu(c_i, f_omega(s)) / sum of exp f_nu(c_j, f_omega(s)) over available a_j
 
@@ -14,31 +14,31 @@ policy that is kept is the one that does best with actions held out for this cho
 
 Baselines: `nearest-neighbor` has an output per training action and executes the available action
 nearest to the one it drew; `continuous` draws a point in the space of representations and executes
-the available action nearest to it; `--representation vae` takes a VAE without hierarchy.
+the available action nearest to it; `--representation vae` takes a plain VAE.
 Ablations: `--ent-coef 0`, `--no-subsample`. Appendix C: C.1 `--task`; C.2 `--finetune`, `--adapt`;
-C.3 `--no-subgoal-reward`; C.4 `--aux-conditioned`; C.5 `--fully-observable`; C.6 `--placement`,
-`--split full`; C.7 curve.png of every run. A.3's analyses: `create --split analysis
+C.3 `--no-subgoal-reward`; C.4 `--[no-]aux-conditioned`; C.5 `--fully-observable`; C.6
+`--placement`, `--split full`; C.7 curve.png of every run. A.3's analyses: `create --split analysis
 --representation hvae-all`, then `evaluate RUN --min-angle-gap 5` and its other options.
 
     python ppo_actiongen.py gridworld --quick         # minutes; or: recsys, create, stacking
-    python ppo_actiongen.py gridworld --recipe paper  # the policy of Tables 3 and 4
+    python ppo_actiongen.py gridworld --recipe paper  # policy of Tables 3, 4 (also: --hvae-recipe)
     python ppo_actiongen.py gridworld --method nearest-neighbor
     python ppo_actiongen.py gridworld --finetune runs/gridworld-s0     # C.2
     python ppo_actiongen.py my_env.py                 # an environment of your own: see README.md
     python ppo_actiongen.py evaluate runs/gridworld-s0 --num-available 20  # see evaluate --help
 
-In the order of this file: hyper-parameters (Tables 3 and 4, without what the environments fix: how
-long episodes are, what a state holds); torchrun; random numbers; networks (D.3.2, C.4); the main
-paper's Algorithm 1, training, and Algorithm 2, acting with unseen actions; then what surrounds
-them: which actions are available, checks, the run's folder, the command `evaluate` (A.3), the
-command line.
+In the order of this file: hyper-parameters (the policy's in Tables 3 and 4, without what the
+environments fix: how long episodes are, what a state holds); torchrun; random numbers; networks
+(D.3.2, C.4); the main paper's Algorithm 1, training, and Algorithm 2, acting with unseen actions;
+then what surrounds them: which actions are available, checks, the run's folder, the command
+`evaluate` (A.3), the command line.
 
-Letters in shapes: T steps of a rollout, N environments, B rows of a batch, K available actions,
+Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
 A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
-f_omega(s). A step is one action of one environment. A *score* is the environment's METRIC at the
-end of an episode (success, click-through rate, height). Two marks: [code] is the authors' released
-implementation, followed where the appendix is silent (a comment says so where the two disagree);
-[here] is a choice of this repository, with its reason.
+f_omega(s). A step is one action of one environment. A *score* is what the environment's METRIC
+names in the last info of an episode (success, click-through rate, height). Two marks: [code] is the
+authors' released program, followed where the appendix is silent (a comment says so where the two
+disagree); [here] is a choice of this repository, with its reason.
 """
 
 import atexit
@@ -94,16 +94,16 @@ class Args:
     quick: bool = False  # the same protocol in minutes, with fewer steps
     method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # or a baseline
     seed: int = 0  # one seed is one run, bit for bit, on one kind of CPU
-    adapt: bool = False  # train on the test actions, all of them available all the time (C.2)
-    finetune: str | None = None  # --adapt, from the policy and the table in that run's folder (C.2)
+    adapt: bool = False  # train on the test actions, a fixed set of them (C.2)
+    finetune: str | None = None  # --adapt, from that run's policy and representations (C.2)
 
     # --- environment ---
     split: str = "default"  # how actions are divided into training, validation and test
     split_seed: int = 0  # seed of that division [code: one division for all seeds]
     task: str | None = None  # CREATE: one of its twelve tasks (C.1)
     subgoal_reward: bool = True  # CREATE: reward for the subgoal (off: C.3)
-    placement: str | None = None  # Stacking: who chooses where a shape falls: none, 1d, 2d (C.6)
-    fully_observable: bool = False  # Recommender: representations hold the popularity, too (C.5)
+    placement: str | None = None  # Stacking: coordinates the policy chooses: none, 1d, 2d (C.6)
+    fully_observable: bool = False  # Recommender: representations hold the constant mu_i, too (C.5)
 
     # --- action representations ---
     # hvae-all: an encoder that was trained on all actions (the oracle); vae: appendix B's baseline.
@@ -114,7 +114,7 @@ class Args:
     # --- which actions are available ---
     num_available: int = 50  # K while training (Table 3 "actions per episode")
     eval_available: int | None = None  # K in evaluations; None: as while training
-    subsample: bool = True  # a random subset per episode; off: always all training actions
+    subsample: bool = True  # a random subset per episode; off: always the same training actions
     fixed_set_size: int | None = None  # --no-subsample or --adapt: only this many actions
 
     # --- PPO (Table 4 unless it says otherwise) ---
@@ -130,7 +130,7 @@ class Args:
     gamma: float = 0.99  # discount factor of later rewards
     clip_coef: float = 0.1  # clipping range of PPO's probability ratio
     vf_coef: float = 0.5  # weight of the value loss
-    clip_vloss: bool = True  # clip the value's steps as well [code]
+    clip_vloss: bool = True  # clip the value's changes as well [code]
     ent_coef: float = 0.05  # weight of the entropy bonus (Table 3); 0: w/o entropy
     ent_floor: float = 1.0  # fraction of ent_coef left when the learning rate has fallen [here]
 
@@ -187,7 +187,7 @@ MAX_GRAD_NORM = 0.5  # [code]
 LR_FLOOR = 0.1  # [code]: the learning rate falls to this fraction
 
 # The fast recipe: every difference from Tables 3 and 4, all of them [here], with its reason. It is
-# for a laptop: a quarter of the published steps or fewer, and more learned from each of them.
+# for a laptop: a quarter of the published steps or fewer, and more updates for each of them.
 FAST = {
     "gridworld": dict(
         one_hot=True,  # a cell's id is a name, not a quantity
@@ -224,12 +224,12 @@ FAST = {
         ent_floor=0.1,  # as in Grid World
         clip_coef=0.2,  # goals are rare, so each of them may teach more
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
-        clip_vloss=False,  # steps of clip_coef are too small for values near 10
+        clip_vloss=False,  # changes of clip_coef are too small for values near 10
         total_timesteps=4_000_000,
         eval_every=102_400,
     ),
     "stacking": dict(
-        published_init=False,  # as in Grid World
+        published_init=False,  # as in Grid World; and towers do not stop at once
         lr_decay_steps=None,  # as in CREATE
         minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
         clip_vloss=False,  # heights, too, are large against clip_coef
@@ -301,7 +301,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of one stream, named by the run's seed, its use, and more; all are independent."""
+    """`n` seeds of one stream, named by the run's seed, its use and, while training, the step."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -338,14 +338,14 @@ def cnn(frames, H, small):
     layers = []
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
-        # [code] keeps PyTorch's initial weights. They are so small that all pictures have nearly
-        # the same features at first, and a run of a few million steps loses time over it [here].
-        # (--small-pictures is the only option that changes the convolutions.)
+        # [code] keeps PyTorch's initial weights, so small that all pictures have nearly the same
+        # features at first. A run of a few million steps would lose time over it: with
+        # --small-pictures (no other option changes the convolutions) they are larger [here].
         if small:
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # every tool scales all features up; that common factor says little, so it goes
+    if small:  # each tool in the picture makes all features larger; that says little, so it goes
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -400,9 +400,9 @@ class Agent(nn.Module):
         # Not saved: they follow from the options, and fine-tuning (C.2) has others.
         self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
 
-        # f_omega and the critic V. With pictures V is linear in f_omega(s) (D.3.2), else it has a
-        # network of its own [code]. The critic does not see the available actions: V is the value
-        # of a state for an average set of them; what a good or a bad set adds is noise to it.
+        # f_omega and the critic V. With pictures V is linear in f_omega(s), else an MLP of its own
+        # (D.3.2) reads s itself [code]. The critic does not see which actions are available: V is
+        # the value of a state for an average set of them; a good or a bad set is noise to it.
         state = envs.single_observation_space["state"]
         self.is_image = len(state.shape) == 3
         if self.is_image:
@@ -518,7 +518,7 @@ class Agent(nn.Module):
         action_part = F.linear(self.table[ids], weight, bias)  # (U, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
-        # into the processor's cache, so they are made in pieces of 800,000 numbers (3 MB) [here].
+        # into the processor's cache, so b rows at a time are made, 800,000 numbers (3 MB) [here].
         piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
         for states, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
@@ -576,8 +576,8 @@ class Agent(nn.Module):
         if self.args.method == "continuous":
             # D numbers were drawn. [code] adds up their entropies in Grid World and averages them
             # elsewhere; [here] the mean, so that ent_coef means the same for every D.
-            # With a tiny standard deviation the sum can be -inf, and the difference of two of them,
-            # in ppo_loss, NaN; hence the limits [code].
+            # With a tiny standard deviation a sum of log-probabilities can be -inf, and in ppo_loss
+            # the difference of two of them NaN; hence the limits [code].
             logprob = logprob.sum(1).clamp(-1e5, 1e5)
             entropy = entropy.mean(1)
 
@@ -610,7 +610,7 @@ class Agent(nn.Module):
 
 # 1. Train the encoder on training actions, then compute c_i for all actions (hvae.py).
 # 2. Repeat: at every reset draw K training actions; play; update by PPO with an entropy bonus;
-#    now and then score on validation actions, and keep the best policy.
+#    every eval_every steps score on validation actions, and keep the best policy.
 # Algorithm 2 is evaluate(): the kept policy with K unseen actions per episode, nothing is learned.
 
 
@@ -657,7 +657,7 @@ def episode_means(episodes):
 
 
 def rollout(envs, obs, agent, num_steps):
-    """Play T steps: a batch of (T, N, ...) tensors, the next observation, the ended episodes."""
+    """Play T actions in each environment: a batch of (T, N, ...), the next obs, ended episodes."""
     # Episodes do not end with the rollout: the next one goes on where this one stops.
     transitions = []
     episodes = []
@@ -695,10 +695,10 @@ def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
 def running_returns(rewards, dones, G, gamma):
     """Discounted sums of the rewards up to now; only their spread is used (NormalizeReward).
 
-    G <- gamma G + r at every step, 0 after an episode. All G (T, N), and the last to go on with.
+    G <- gamma G + r at every step, 0 after an episode. Returns all G (T, N), and the last (N,).
     """
-    # Why not the true returns, which look ahead? They would have to wait for the episode's end. The
-    # sum up to now is known at once, and all that is needed is a rough size of the returns.
+    # Why not the true returns, which look ahead? An episode's end may be still to come. All that is
+    # needed is a rough size of the returns, and sums up to now have it [code].
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
         G = gamma * G + rewards[t]
@@ -747,7 +747,7 @@ def update(agent, optimizer, batch, ent_coef):
     advantages = torch.cat(gather_from_all(flat["advantage"].cpu()))
     flat["advantage"] = (flat["advantage"] - advantages.mean()) / (advantages.std() + 1e-5)
     # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
-    # the first of them the policy is no longer the one that played, hence the ratio in ppo_loss.
+    # the first step the policy is no longer the one that played, hence the ratio in ppo_loss.
     parameters = list(agent.parameters())
     for _ in range(agent.args.update_epochs):
         order = torch.randperm(len(flat["value"]), device=agent.table.device)
@@ -811,8 +811,8 @@ def train(args):
         if starts_afresh:
             # At the beginning and after every checkpoint, all random numbers and all episodes start
             # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
-            # Episodes still running are dropped. Nothing is lost: the rollout before this line has
-            # been learned from, with `next_value` (below) in place of what was to come.
+            # Episodes still running are dropped. Nothing is lost: the last iteration has learned
+            # from them, with `next_value` (below) in place of what was to come.
             torch.manual_seed(seeds(1, args.seed, TORCH, step, RANK)[0])
             obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
             G = torch.zeros(N, device=device)  # see running_returns
@@ -827,7 +827,7 @@ def train(args):
         # Collect. The regulariser *subsampling* works here: at every reset each environment draws
         # its own K available actions out of the training actions (make_envs told it the pool and K)
         # and shows their ids in obs["available"]. The policy cannot count on any one action, so it
-        # has to read the representations. (--no-subsample: K is all of them.)
+        # has to read the representations. (--no-subsample: always the same set.)
         batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
 
         # Judge. Rewards are divided by the standard deviation of a running return, so that values
@@ -856,13 +856,13 @@ def train(args):
         step += rollout_size
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
-        # with actions which neither encoder nor policy was trained on. Test actions are not looked
-        # at before the end: the best of many noisy scores is optimistic, the test is not. (Only
-        # the oracle encoder, hvae-all, was trained on all actions.)
+        # with actions which neither encoder nor policy was trained on. Test actions do not select:
+        # the best of many noisy scores is optimistic, so the one that is reported must be another.
+        # (Only the oracle encoder, hvae-all, was trained on all actions.)
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
-            stream = (args.seed, VALIDATION, step)
+            stream = (args.seed, VALIDATION, step)  # one for both: only the actions differ
             train_score = evaluate(agent, phases["train"], args.valid_episodes, stream)["score"]
             valid_score = train_score  # C.2 has no actions but those that it adapts to
             if not args.adapt:
@@ -936,7 +936,7 @@ def evaluate(agent, phase, episodes, stream):
 
 # ---- which actions are available, and what is known about them ----
 
-# Options that an environment's make_vec takes, by their names in Args.
+# Options that an environment's make_vec (see make_envs) takes, by their names in Args.
 OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}
 # How the encoders of --representation differ from hvae.py's defaults.
 ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
@@ -1020,7 +1020,7 @@ def load_table(args):
     if args.finetune:  # the policy goes on with the table it knows
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
     # Representations made by hand: an environment computes them from what it knows of its actions.
-    # Grid World has variants: "engineered-5d" is its five moves as five numbers (B).
+    # Grid World has variants: "engineered-5d" is its five moves as five numbers (appendix B).
     if args.representation.startswith("engineered"):
         module = hvae.load_environment(args.env)
         options = {}
@@ -1080,7 +1080,7 @@ def choose_device(args):
 
 
 def check(args):
-    """UserError, before anything is written, for what cannot be trained."""
+    """UserError, before anything is written, for the usual mistakes."""
     # Names that only some environments know; each lists its own.
     module = hvae.load_environment(args.env)
     names = dict(split="SPLITS", task="TASKS", placement="PLACEMENTS")
@@ -1117,7 +1117,7 @@ def run_name_of(args):
     name = args.run_name
     if name is None:
         usual = vars(default_args(args.env, args.recipe, args.quick))
-        usual.update(recipe="fast", quick=False)  # else these two would equal the run's own
+        usual.update(recipe="fast", quick=False)  # so that these two, too, appear in the name
         words = [hvae.environment_name(args.env)]
         for option, value in vars(args).items():
             if value != usual[option] and option not in ("seed", *FREE):
@@ -1203,7 +1203,7 @@ class Log:
         self.path = folder / "metrics.csv"
         self.path.touch()
         os.truncate(self.path, size)  # rows after the checkpoint are made again
-        self.writer = SummaryWriter(folder, purge_step=step)
+        self.writer = SummaryWriter(folder, purge_step=step + 1)
         print(f"run: {folder}", flush=True)
         steps = dict(total=args.total_timesteps, initial=step)
         self.bar = tqdm(**steps, unit="step", unit_scale=True, disable=None)  # only on a terminal
@@ -1228,7 +1228,7 @@ class Log:
 def finish(folder, agent, phases, step, seconds):
     """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
     # The last policy is forgotten; what is tested is the one that validation has selected. Except
-    # in C.2, test actions are met here for the first time, and no decision depends on their scores.
+    # in C.2, the policy meets test actions here for the first time; their scores decide nothing.
     args = agent.args
     best = load(folder / "best.pt")
     put(best, folder, agent=agent)
@@ -1255,7 +1255,7 @@ def finish(folder, agent, phases, step, seconds):
 def plot_curve(folder, metric):
     """C.7, Figure 14: scores over steps, as measured ([code] draws the best score so far)."""
     # With the same K, the distance between the two lines is what the policy has learned by heart.
-    os.environ.pop("MPLBACKEND", None)  # one inherited from a notebook ends the import
+    os.environ.pop("MPLBACKEND", None)  # a notebook's makes the import fail
     from matplotlib.figure import Figure  # not pyplot, which looks for a display
 
     rows = np.genfromtxt(folder / "metrics.csv", delimiter=",", names=True, encoding="utf-8")
@@ -1299,8 +1299,8 @@ class EvaluateArgs:
     run: tyro.conf.Positional[str]  # the run's folder
     actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
     num_available: int | None = None  # K; None: as in the run's own test
-    min_angle_gap: float | None = None  # CREATE: only tools at least this many degrees away
-    min_embedding_distance: float | None = None  # .3: without the 30 % nearest to training actions
+    min_angle_gap: float | None = None  # CREATE: only tools this many degrees from training tools
+    min_embedding_distance: float | None = None  # a share; .3: without the nearest 30 %
     unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
     episodes: int = 5000  # episodes to play
     save: bool = False  # append the scores to evaluations.csv in the run's folder
