@@ -55,7 +55,7 @@ SIZE = 9  # A.1; the outer ring is wall [code], so the agent walks on 7x7 cells
 EMPTY, WALL, GOAL, LAVA, AGENT, SUBGOAL = 1, 2, 8, 9, 10, 11  # [code] (A.1: "integer ID")
 RIVERS = (3, 4, 5)  # [code]: rows or columns of the lava (A.1: "randomly placed")
 OPENINGS = (1, 2, 3, 4, 5, 6, 7)  # [code]: any cell of the river may be the opening
-# The 80x80 play grid has a ring of wall, too [code], so the agent stands on 1..78 both ways.
+# The 80x80 grid of the recordings has a ring of wall, too [code]: the agent stands on 1..78.
 PLAY_LOW = 1
 PLAY_HIGH = 78
 
@@ -82,13 +82,13 @@ def action_labels() -> np.ndarray:
 
 
 def engineered_representations(variant: str = "12d") -> np.ndarray:
-    """Ground-truth features of all skills (B), float32 (1024, d), in cells; y grows downwards.
+    """Ground-truth features of all skills (B), float32 (1024, d).
 
-    "12d": net (dx, dy) of the skill, then (dx, dy) of each of its five moves.
+    "12d": in cells, y downwards: net (dx, dy) of the skill, then (dx, dy) of each of its moves.
     "5d": the five moves; right, down, left, up as -1, -1/3, 1/3, 1. ValueError for others.
     """
     # appendix: 5-d; [code] 12-d with all signs flipped, which is the same to a learner; [here] 12-d
-    # by default, not flipped: the paper's result was reached with it, and the numbers of 5-d
+    # by default, not flipped: the paper's result was reached with 12-d, and the numbers of 5-d
     # suggest an order of the moves that does not exist.
     if variant not in VARIANTS:
         raise ValueError(f"variant {variant!r} is unknown; there are {VARIANTS}")
@@ -142,7 +142,7 @@ SKILL_OFFSETS = (MOVE_DELTAS @ (SIZE, 1))[SKILL_MOVES].tolist()  # 1024 lists of
 
 def walk(grid: list[int], cell: int, skill: int) -> list[int]:
     """The cells after each move of `skill` from `cell`; fewer than five if the episode ends."""
-    # E.g. UUURD from (3, 2), cell 29: 28, 28, 28, 37, 38. Its second and third up meet the wall.
+    # E.g. UUURD from (1, 2), cell 11: 10, 10, 10, 19, 20. Its second and third up meet the wall.
     cells = []
     for offset in SKILL_OFFSETS[skill]:
         # A.1: at the wall the agent stays where it is. This "null interaction" counts as a move.
@@ -160,7 +160,7 @@ class GridWorldEnv(gym.Env):
     """Lava crossing with five-move skills (appendix A.1).
 
     One row or column (3, 4 or 5) is lava with one opening, the subgoal. A move into a wall does
-    nothing, but counts. The best return (below) is undiscounted, and needs suitable skills.
+    nothing, but counts. The best return (below) is for gamma = 1, and needs suitable skills.
 
     ## Action Space
     `Discrete(K)`: a position in `available`.
@@ -259,7 +259,7 @@ class GridWorldEnv(gym.Env):
             reward += 1 - LAMBDA_GOAL * moves / MAX_MOVES
 
         # End (A.1): goal, lava, or the limit. [here] the limit is `truncated`, gymnasium's word for
-        # an end that only a clock makes; [code] makes no difference, and a learner may ignore it. A
+        # an end that only a clock makes; [code] treats both alike, as a learner may here, too. A
         # skill that nothing cuts has five moves, so the limit is met exactly.
         terminated = success or entered[-1] == LAVA
         truncated = not terminated and moves >= MAX_MOVES
@@ -306,10 +306,10 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
     return envs
 
 
-# ---- A.1 Action Observations: the play world ----
-# For hvae.py. Of a recording of what a skill does, the first state is scaled from 0..79 to -1..1,
-# (cell - centre) / half_width; later states are differences in cells (step). Why cells: the least
-# standard deviation of the decoder is 0.135 [code], so a move of 1 is about 7 of them. In scaled
+# ---- A.1 Action Observations: the world of the recordings ----
+# hvae.py scales recordings: first states to -1..1, (cell - centre) / half_width; moves from a state
+# to the next are divided by step, so they stay in cells. [here], because the least
+# standard deviation of the decoder is 0.135 [code], and a move of 1 is about 7 of them. In scaled
 # coordinates a move would be 0.025, lost in the noise.
 UNITS = dict(centre=39.5, half_width=39.5, step=1.0)
 
@@ -362,7 +362,7 @@ QUADRANTS = {  # B, Figure 4: upper right is red
 
 
 def draw_frame(env: GridWorldEnv, moves: int) -> np.ndarray:
-    """As in Figure 1, after `moves` moves; beside it the state: uint8 (420, 600, 3)."""
+    """As in Figure 1, after `moves` moves; beside it what the policy saw: uint8 (420, 600, 3)."""
     # Drawn four times too large and averaged down, for smooth edges: a grid cell has 160 pixels.
     image = Image.new("RGB", (2400, 1680), COLORS[EMPTY])
     draw = ImageDraw.Draw(image)

@@ -11,15 +11,15 @@ given to the decoder (a picture has none). With a draw of c ~ q(c | X), z_j ~ q(
 
 Only `--recipe paper` uses this weight of the last term; the shorter recipes, quick and fast, divide
 it by more than |X| (`kl_c_divisor`). The representation of an action is the mean of q(c | X). The
-networks learn from training actions and CREATE's no-op (the oracle encoder's from all of the
-split), and the last update's weights count. Then every action of the split and the no-op are
-encoded, without re-training: a table, one row per action. Actions in no part keep a row of zeros.
+networks learn from training actions and CREATE's no-op; with `--train-on all`, the oracle encoder,
+from all of the split. The last update's weights count. Then every action of the split and the no-op
+get a row of a table, without re-training. Actions in no part of the split keep a row of zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
     python hvae.py gridworld --train-on all      # the oracle encoder: trained on all parts
     python hvae.py create --modality video       # B: videos; B's Full Split: --split full
-    python hvae.py gridworld --recipe paper      # Tables 3-4: days on a CPU; add --help: numbers
+    python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU (--help shows them)
     python hvae.py my_env.py                     # an environment of your own, in a file
 
 Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed SPLITS (names),
@@ -30,10 +30,10 @@ NO_OP (an id), UNITS (see `prepare`); and
     action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
 An observation is (L, F), L states of F numbers each; but of modality "onehot" (L, 2), a cell's x
-and y as whole numbers 0-79, at most 39 from the first; of "image" (S, S), "video" (L, S, S), greys
-0-255, S 48 or 84. Random numbers must depend on seed *and* id: there are several calls, each with
-`workers` processes. Marks: "appendix:" is that of Generalization to New Actions in Reinforcement
-Learning (ICML 2020); [code] is the authors' program; [here] our choice, with its reason.
+and y as whole numbers 0-79, at most 39 from the first and the last one; of "image" (S, S), "video"
+(L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on seed *and* id: several calls are
+made, each may start `workers` processes. Marks: "appendix:" that of Generalization to New Actions
+in Reinforcement Learning (ICML 2020); [code] the authors' program; [here] our choice, and why.
 """
 
 import hashlib
@@ -60,7 +60,7 @@ from tqdm import tqdm
 # of F numbers per trajectory, the first given, T = L - 1 predicted; C = Z sizes of c, z; H hidden
 # width; E of an encoded observation: H, or H + L * F with the linear path; S side of a picture.
 
-# Name on the command line -> module. (The Recommender has nothing to encode: here for its tables.)
+# Name on the command line -> module. (The Recommender needs no encoder: here for loading tables.)
 ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
@@ -94,7 +94,7 @@ class Args:
     observations: int  # recorded of each action; its representation comes from all of them
     batch_observations: int  # observations of each action in an update
     kl_c_divisor: int  # divides KL(q(c|X) || N(0, I)); in the ELBO: batch_observations
-    relative: bool  # trajectories: moves are read, later states predicted from the first one
+    relative: bool  # trajectories: moves are read, offsets from the first state predicted
     kl_warmup: float = 0.0  # share of the updates in which the weight of the KLs climbs to 1
     compact_lstm: bool  # a Bi-LSTM of half the width, directions concatenated (none in pictures)
     log_var_start: float | None  # initial log-variance of the decoder (None: from N(0, 1))
@@ -103,9 +103,9 @@ class Args:
 
 # ---- Tables 3 and 4 ----
 
-# Args explains the rows. "paper" has the tables' numbers, but for `hidden` of pictures; "fast", the
-# default, takes minutes on a CPU, more for pictures; "quick" is a first try. Counts and rates of
-# these two are [here]: tried by hand, judged by `probe` (on validation and test actions together).
+# Args explains the rows. "paper" has the tables' numbers (pictures, videos: see below); "fast", the
+# default, takes minutes on a CPU, more for pictures; "quick" is shorter, or the same. Counts and
+# rates of both are [here]: tried by hand, judged by `probe` (on validation and test actions).
 # fmt: off
 HYPERPARAMETERS = {  # columns: quick, fast, paper
     "representation_size": (16,    16,    16),      # Table 3
@@ -124,14 +124,14 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     # Grid World's raw cells run from 1 to 78, a move changes them by 1: the networks would first
     # have to learn to subtract. Differences show the skill from the first update.
     "relative":            (True,  True,  False),
-    # A Bi-LSTM of half the width has a quarter of the weights and 0.6 of the time of an update.
+    # A Bi-LSTM of half the width has a third of the weights or fewer, 0.6 of the time of an update.
     "compact_lstm":        (True,  True,  False),
     # RAdam moves a parameter by about the learning rate per update at most: 1e-3 is too slow for a
     # log-variance that starts near 0 and has to fall to the clamp at -4 (ObservationModel.forward).
     "log_var_start":       (-2.0,  -2.0,  None),
     "log_var_rate":        (10.0,  10.0,  1.0),
 }
-# Rows above, or defaults, are replaced by the modality's; if it has none, the environment's.
+# They replace rows above or defaults of Args: the modality's or, if it has none, the environment's.
 EXCEPTIONS = {
     "onehot": {"updates": (2_000, 4_000, 0)},  # it takes longer to learn what 160 numbers mean
     # Without these changes the model ignored z (how the ball was launched): the squared error, in
@@ -356,7 +356,7 @@ class ActionInference(nn.Module):
         self.norm = GlobalBatchNorm()  # [code] over mean and log-variance together
 
     def forward(self, h):
-        # A mean depends on no order, and its size on no number: 4 in training, 1,024 at the end.
+        # A mean ignores the order, and how many there are: 4 in training, 64 or 1,024 at the end.
         pooled = self.before(h).mean(1)  # (A, n, H) -> (A, H)
         return normal(*self.norm(self.after(pooled)).chunk(2, -1))  # (A, 2C) -> twice (A, C)
 
@@ -364,15 +364,15 @@ class ActionInference(nn.Module):
 class ObservationInference(nn.Module):
     """Observation Inference Network: encoded x (B, E), c (B, C) -> q(z | x, c), Gaussian (B, Z)."""
 
-    # Only in [code]: the batch norm; p(z | c), by the same network without x. VAE: q(z | x), no c.
+    # Only in [code]: the batch norm; for p(z | c) a second such network, without x. VAE: without c.
     def __init__(self, inputs, hidden, size):
         super().__init__()
         self.sum = SumReLU(inputs, hidden)
         self.layers = nn.Sequential(
             Residual(hidden, 2), Residual(hidden, 2), nn.Linear(hidden, size), GlobalBatchNorm()
         )
-        # appendix: networks output the log-variances of q(z|x,c) and the decoder; [code] learned
-        # constants, from N(0, 1), of p(z|c), too; [here] as the code, which made the results.
+        # appendix: networks output the log-variances of q(z|x,c) and the decoder; [code] these and
+        # that of p(z|c) are learned constants, at first from N(0, 1); [here] as the code.
         self.log_var = nn.Parameter(torch.randn(size))
 
     def forward(self, *inputs):
@@ -421,8 +421,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0 is the picture, 1 its mask (see decode). Frames are dark on white: grey is worse
-        # than the first frame, and the mask would fall to 0. [here] So it starts white, at .95.
+        # Channel 0 is the picture, 1 its mask (see decode). Untrained pictures are grey: worse than
+        # the first frame, so the mask would fall to 0. [here] The picture starts white, at .95.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -468,7 +468,7 @@ class ObservationModel(nn.Module):
             self.path = nn.Linear(self.encoded_size, args.representation_size)
 
     def encode(self, x):
-        # What `prepare` returns first -> start (B, F), for the decoder; encoded ones (B, E).
+        # What `prepare` returns first -> start (B, F), for the decoder; encoded x (B, E).
         if self.args.modality in VISUAL:
             features = self.conv(x.flatten(0, 1))  # (B * L, 1, S, S) -> (B * L, 288)
             x = features.unflatten(0, x.shape[:2])  # (B, L, 288)
@@ -478,8 +478,8 @@ class ObservationModel(nn.Module):
         return x[:, 0], h
 
     def add_linear_path(self, q, h):
-        # [here] The mean of c (VAE: of z) = Linear(h, averaged over the set) + 0.1 * q.mean. The
-        # deep part counts a tenth. Why c does not collapse then is not known: found by trying.
+        # [here] The mean of c (VAE: of z) = Linear(h) + 0.1 * q.mean; the HVAE's h is averaged over
+        # the set. Why c does not collapse then is not known: found by trying.
         if self.path:
             q = Normal(self.path(h) + 0.1 * q.mean, q.stddev, validate_args=False)
         return q
@@ -553,7 +553,7 @@ class VAE(ObservationModel):
     """The non-hierarchical baseline (B): encodes observations one by one, averages at the end."""
 
     # [code] A quarter of the HVAE's updates, another initialisation, and the mean of 62 or 128
-    # observations; [here] all as the HVAE, so that the comparison shows the hierarchy alone.
+    # observations; [here] trained as the HVAE, but kl_c_divisor weakens only the HVAE's KL of c.
     def __init__(self, args, shape):
         size = args.representation_size
         super().__init__(args, shape, latents=(size,))
@@ -641,7 +641,7 @@ def observe(module, ids, args):
 
 def fit(model, data, rows, args):
     # Maximise the objective on data[rows]; return the losses of every update, a list of dicts.
-    # Log-variances that are parameters, by their name, have a learning rate of their own.
+    # Parameters called log_var have a learning rate of their own.
     groups = []
     for name, parameter in model.named_parameters():
         factor = args.log_var_rate if name.endswith("log_var") else 1.0
@@ -791,7 +791,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
 
 
 def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
-    """How well simple models, fitted on training actions, read known facts off held-out rows."""
+    """How well known facts can be read off held-out rows, by models fitted on training rows."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
     from sklearn.pipeline import make_pipeline
@@ -809,7 +809,7 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     # 0.970, 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
     scores = {}
     if environment_name(env) == "gridworld":
-        net = features[:, :2]  # [code] columns 0-1: net displacement (x, y), -5..5
+        net = features[:, :2]  # [code], not B: the net displacement, -5..5
         logistic = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000))
         scores["net_r2"] = score(ridge, net)
         scores["move_accuracy"] = np.mean([score(logistic, m) for m in module.SKILL_MOVES.T])
