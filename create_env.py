@@ -91,12 +91,12 @@ STILL_ACTIONS = 2
 HIT_DISTANCE = 0.03  # [code] share of the screen's diagonal, 3.56 units: the target hit
 PICTURE_EVERY = 8  # [here] physics steps between colour pictures: 5 pictures per action
 
-BALL_RADIUS = 4.0  # [code] units: target, marker, goal and probe ball
+BALL_RADIUS = 4.0  # [code] units: marker, goal and probe ball, and the target in most tasks
 BALL_MASS = 10.0  # [code]
 PLANK_MASS = 10.0  # [code] of levers and see-saws
 PLANK_MOMENT = 10_000.0  # [code] a rod of 20 units would have 333, so planks turn slowly
 LADDER_LEAN = 4.0  # [code] sideways a ladder carries so many times faster than its angle says
-VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; not among the engineered features
+VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; not in engineered_representations
 
 METRIC = "success"  # the goal was reached in the episode (0 or 1)
 MODALITIES = ("state", "xy", "video")  # the first is the default; see action_observations
@@ -119,7 +119,7 @@ class Tool(NamedTuple):
     kind: str  # its class, a key of KINDS
     elasticity: float = 0.0
     angle: float = 0.0  # degrees
-    size: float = 0.0  # units: length of segments and planks, radius of discs and polygons
+    size: float = 0.0  # units: length of segments and planks, side of boxes, radius of others
     damping: float = 0.0  # of planks: 1.05 takes 5 % of a ball's speed at every step; <= 1: none
     max_angle: float = 0.0  # degrees: see-saws turn by so much to both sides
     mass: float = 0.0  # of balls and boxes; of the weight on one end of a see-saw
@@ -155,12 +155,12 @@ SOFT = (0.1, 0.3, 0.5)  # elasticities
 BOUNCY = (0.8, 1.0, 1.2)
 LENGTHS = (6, 10, 14, 18, 22)
 PLANK_LENGTHS = (12, 14, 16, 18, 20)
-# [code] Ramps have a damping of 1, which does nothing, as a number for their engineered features.
+# [code] Ramps have a damping of 1, which does nothing but show in engineered_representations.
 RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)}
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# Angles point to a corner: squares at 45 degrees lie flat, [code]'s class of boxes, in no split.
+# A corner points to the angle. At 45 degrees squares lie flat: [code]'s boxes, which no split has.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. Planks and ball tools have no friction: [code] forgets to set it.
@@ -176,8 +176,8 @@ BALLS = {"elasticity": (0.1, 0.2, 0.3, 0.4, 0.5), "size": (3, 5, 7, 9), "frictio
 BOUNCY_BALLS = {"elasticity": (0.8, 0.9, 1.0, 1.1, 1.2), "size": (3, 5, 7, 9), "friction": (0,)}
 BELTS = {"size": range(6, 25, 2), "speed": (1, 2, 3, 4, 5, 6, -1, -2, -3, -4, -5, -6)}
 
-# Colours whose greys (0.299 R + 0.587 G + 0.114 B) are those that [code] shows to the policy, which
-# mirrors its pictures and takes some from image files; [here] all are flat shapes.
+# Colours whose greys (0.299 R + 0.587 G + 0.114 B) are those that [code] shows to the policy. Its
+# pictures are mirrored left to right, and some are image files; [here] flat shapes, not mirrored.
 ORANGE = "#fa8535"
 BLUE = "#086788"
 WOOD = "#fa9149"
@@ -186,7 +186,7 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    # Never drawn or placed: a disc that gives the launches of the probe ball a moment of contact.
+    # Never drawn or placed; a disc, because recordings of the probe ball begin around its touch.
     "No-op": Kind("disc", GREEN, GOAL),
     # The tools in the order of their ids, which saved representations and runs rely on. Down to the
     # bucket they are those of the Default Split.
@@ -286,7 +286,7 @@ IS_COARSE |= np.isin(TOOL_KINDS, list(OWN_KINDS))
 
 
 def action_labels() -> np.ndarray:
-    """Class of every tool, (NUM_ACTIONS,) of str: the names of Table 1, both see-saws as one."""
+    """Class of every tool, (NUM_ACTIONS,) of str: the keys of KINDS, both see-saws as one."""
     return np.array([tool.kind.removeprefix("Hinged ") for tool in TOOLS])
 
 
@@ -505,7 +505,7 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # The marker rolls down to the right. It has to pass a stack of boxes and the subgoal, and to
+    # The marker rolls down to the right, where boxes fall. It has to reach the subgoal there and to
     # come back below to the target, which then rolls down to the star.
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
@@ -704,7 +704,7 @@ class SceneObject:
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
-            # [code] Nothing hits it, for it has no shape. The gear turns it as the plank turns.
+            # [code] Nothing hits it, for it has no shape. The gear [code] turns it with the plank.
             weight = pymunk.Body(self.tool.mass, self.tool.mass)
             weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
@@ -745,7 +745,7 @@ def _on_carrier(arbiter, space, data) -> None:
 
 
 def _on_cannon(arbiter, space, data) -> None:
-    """A cannon shoots when contact begins; later steps of it would catch its own shot."""
+    """A cannon shoots when a contact begins; later it would catch its own shot again."""
     mover, cannon = (shape.owner for shape in arbiter.shapes)
     aim = radians(cannon.tool.angle)
     if mover.held_by is None:  # a bucket does not let go
@@ -806,8 +806,8 @@ def make_space() -> pymunk.Space:
     # begin: once per contact. pre_solve, post_solve: at every step, before and after the forces.
     # A target that stays on a goal is noted anew: `_judge` forgets the touch after each action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
-    # Of two balls once is enough: a marker's touch is never forgotten, and where the goal is a ball
-    # there is no marker, so that the first touch ends the episode.
+    # Of two balls once is enough: a marker's touch is never forgotten, and no task has a marker and
+    # a ball as goal (keep it so), so the first touch of a goal ball ends the episode.
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
     space.on_collision(MOVING, LADDER, pre_solve=_on_carrier)
@@ -949,8 +949,8 @@ class CreateEnv(gym.Env):
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a tool that is refused.
     In tasks with a marker the goal counts only from the target hit on. This pays +1 (obstacle: +2)
-    and is the first time that the target is more than 3.56 units from its start, whatever moved it;
-    in obstacle and cannon the marker must also have touched it.
+    and is the first end of an action with the target over 3.56 units from its start, whatever moved
+    it; in obstacle and cannon the marker must also have touched it.
 
     ## Episode End
     Terminated: goal reached; target off the screen; marker off the screen before the target hit;
@@ -989,7 +989,7 @@ class CreateEnv(gym.Env):
         super().reset(seed=seed)
 
         # Subsampling: every episode has its own few tools of the pool. If all are to be available,
-        # nothing is drawn. (In tests of the Full Split [code] draws a class, then a tool of it.)
+        # nothing is drawn. (In tests of the Full Split [code] draws a class first; [here] not.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
@@ -1127,8 +1127,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. [code]: a touch before the hit counts once the hit comes. [here] those
-        # of earlier actions are forgotten, because the hit has to bring the target to the goal.
+        # Then the goal. A touch before the hit, as by a fan where the marker must touch the target:
+        # [code] counts it once the hit comes; [here] not, because the hit is to bring it there.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1247,8 +1247,8 @@ PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; 
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
 # The scale of the numbers for hvae.py. It reads the first state as (x - centre) / half_width, each
-# later one as (x - the one before) / step, velocities likewise. [here] step is 4 pixels: the least
-# deviation of its decoder, exp(-4 / 2) = 0.135 steps, is then about half a pixel.
+# later one as (x - the one before) / step, velocities likewise. [here] step is 4 pixels: the
+# decoder's log-variance is at least -4, its deviation exp(-4 / 2) = 0.135 steps, half a pixel.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1293,8 +1293,8 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
     missing = np.arange(n)  # trajectories that are still to be recorded
     attempt = 0
     while len(missing):
-        # A ball starts anywhere and flies at the tool's centre. [code] Its speed grows by 40 % with
-        # every attempt, and with the distance; then it varies at random by 40 % up and down.
+        # A ball starts anywhere and flies at the tool's centre. [code] Its speed grows with the
+        # distance, and by 40 % of the first with every attempt; then it varies by 40 % up and down.
         start = rng.uniform(-1.0, 1.0, (len(missing), 2))
         gap = places[missing] - start
         distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (missing, 1) norm

@@ -111,7 +111,7 @@ REST_DEPTH = 0.01  # m; an eighth of the thinnest shape
 # does not see the top of a higher tower.
 FRONT = ((0.0, -7.0, 2.5), (0.0, 0.0, 2.5))
 RAISED = ((0.0, -4.0, 5.5), (0.0, 1.66, 0.0))  # for 2D Place, where depth matters
-# Action observations are taken from a band around the shape [code]; 38 long shapes do not fit in.
+# Action observations are taken from a band around the shape [code]; 38 shapes exceed the picture.
 VIEW_RADIUS = 2.0  # m
 VIEW_HEIGHT = (0.5, 2.0)  # m
 # [here] The light comes from over the photographer's right shoulder: (right, up, back), of length
@@ -121,7 +121,7 @@ TABLE = (4.0, 2.0, 0.1)  # half sizes, m; [code] draws 8 x 4, the thickness is [
 WOOD = (0.82, 0.66, 0.45)  # [here] the lit table is 120 of 255 in grey (2D Place: 167)
 # For people, all [here]: the colour pictures of `render`, and of GIFs while a shape falls.
 COLOUR_SIZE = 336  # pixels
-COLOUR_CAMERA = ((0.0, -12.8, 5.7), (0.0, 0.0, 4.35))  # up to a height of 9.5, more than any tower
+COLOUR_CAMERA = ((0.0, -12.8, 5.7), (0.0, 0.0, 4.35))  # up to a height of 9.5
 FRAME_EVERY = 20  # simulation steps from picture to picture: .2 s, which a GIF shows in .1 s
 
 
@@ -154,13 +154,13 @@ class Family:
 
     name: str  # [code]
     points: np.ndarray  # (V, 3) at scale 1, from the shape's origin, which is what gets a place
-    scales: tuple  # the smallest, the largest, how many
+    scales: tuple  # the smallest, the largest, how many; all times SCALE_FACTOR
     num_angles: int = 1
     turn: float = 0  # degrees: `num_angles` equally spaced angles in [0, turn)
     label: str = ""  # its class in Table 2, where that is not the name
     bullet_type: int = p.GEOM_MESH
     moments: tuple = ()  # of inertia about x, y, z at scale 1 and mass 1; only of a round solid
-    same_as: str = ""  # the family that has the same solid, on another face or as another mesh
+    same_as: str = ""  # the family that has the same solid, on another face or as a plain copy
 
     def parts(self) -> np.ndarray:
         """The convex parts (P, V, 3): one, but three for the arch."""
@@ -190,9 +190,9 @@ CYLINDER = np.vstack([ring(32, 1), ring(32, -1)])
 # those of [code], except for `rectangle`: its footprint is a square, so [code]'s six angles in half
 # a turn show every shape twice; [here] they divide a quarter turn, because A.4 wants the shapes
 # different. Cube and pyramid repeat after 90 degrees, of which [code] uses only the first 45; kept.
-# [code] has the cone twice, as two meshes; kept for the count of 810. Table 2 has two classes more
+# [code] has two cone meshes; here one, twice, for the count of 810. Table 2 has two classes more
 # than A.4, angled-triangle and angled-rectangle, and does not say what they are. In [code] they are
-# the families `middle_triangle`, `hat` and `horizontal_rectangle`, the unseen ones of that table.
+# the families `middle_triangle`, `hat` and `horizontal_rectangle`, all among its unseen shapes.
 # The moments of a capsule: its tube (3/5 of the mass) and half a ball at each end.
 FAMILIES = (
     Family("middle_triangle", points=prism((-1, -1), (1, -1), (0, 1)),
@@ -235,7 +235,7 @@ class Shape(NamedTuple):
 
     family: Family
     scale: float  # m
-    angle: float  # about the vertical, radians; the recordings do not tell it, see `_views`
+    angle: float  # about the vertical, radians; pictures do not tell it, see `_views`
 
     def solid_key(self) -> tuple:
         """(name, scale), equal for two shapes that are one solid, on whatever face they lie."""
@@ -263,7 +263,7 @@ COLOURS = [random_colour(_rng) for _ in SHAPES]
 
 @functools.cache
 def mass_properties(family: Family) -> tuple:
-    """Centre of mass (3,), body -> shape frame, principal moments (3,); for scale 1, mass 1."""
+    """Centre of mass (3,), principal axes (a Rotation), moments (3,); for scale 1, mass 1."""
     if family.moments:
         return np.zeros(3), Rotation.identity(), np.array(family.moments)
     # A solid with flat sides is cut into tetrahedra, whose volumes and centres are known.
@@ -336,8 +336,8 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
     # training shape of its family; all angles of a scale stay together. [code] draws per family;
-    # [here] families of one solid (a family at a scale) share their draws, because else a cone
-    # would be in training and its copy, the other cone, in the test. So go through the families.
+    # [here] one draw decides for a solid (form and size) in all families that have it: else a cone
+    # would be in training and its copy, the other cone, in the test. Go through the families.
     # What an earlier family has decided, for training or against it, stays. From the other solids
     # draw until half of the family is in training: `cone-hires` draws half of its solids, so `cone`
     # finds all of its own decided; `rectangle` shares one with `horizontal_rectangle`.
@@ -360,8 +360,8 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
-    # A.4: "randomly splitting the test set into half". Shapes of one solid and one angle stay
-    # together as a group, so the two cones do; other angles of a solid may be on both sides. The
+    # A.4: "randomly splitting the test set into half". Only shapes of one solid and one angle, like
+    # the two cones, stay together as a group; different angles may be in different halves. The
     # groups are dealt in random order: to validation until it has its half, the others to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
@@ -500,8 +500,8 @@ def grey(rgb: np.ndarray) -> np.ndarray:
 # ---- A.4: the environment ----
 def eq4_reward(heights: np.ndarray) -> float:
     """Eq. 4 at the end of an episode, from the heights h_i (of centres of mass) of all N shapes."""
-    # A.4 counts all N shapes in the scene, so the two cylinders as well; [code] averages only over
-    # shapes whose origin is above .5 m, and subtracts .5 m from each.
+    # [code] has the mean only of shapes with an origin above .5 m, and subtracts .5 m from each;
+    # [here] all N shapes in the scene count, as A.4 says, so the two cylinders as well.
     return float(LAMBDA_TOP * heights.max() + LAMBDA_AVG * heights.mean())
 
 
@@ -653,8 +653,8 @@ class StackingEnv(gym.Env):
             self._settle()
 
         # The episode ends where the agent says so, and after ten actions. [here] the limit is
-        # `truncated`, gymnasium's word for an end that only a clock makes; [code] makes no
-        # difference, nor does ppo_actiongen.py: it bootstraps after neither.
+        # `truncated`, gymnasium's word for an end that only a clock makes; [code] does not
+        # tell the two apart, nor does ppo_actiongen.py: it bootstraps after neither.
         terminated = bool(stop)
         truncated = not terminated and self._steps >= MAX_STEPS
         self._over = terminated or truncated
@@ -703,14 +703,14 @@ class StackingEnv(gym.Env):
         return all(contact[8] > -REST_DEPTH for contact in self._bullet.getContactPoints())
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres of mass (n, 3), rotations body -> world (n, 3, 3) of all bodies, `shape_ids`."""
+        """Centres of mass (n, 3), rotations body -> world (n, 3, 3), ordered as `shape_ids`."""
         poses = map(self._bullet.getBasePositionAndOrientation, self._bodies)
         centres, quaternions = zip(*poses, strict=True)
         rotations = list(map(p.getMatrixFromQuaternion, quaternions))  # (n, 9)
         return np.array(centres), np.reshape(rotations, (-1, 3, 3))
 
     def top(self) -> float:
-        """Height of the highest point of the scene; of what is round, within .01 m."""
+        """Height of the highest point of the scene; of what is round, to about .01 m."""
         highest = 0.0
         for shape_id, centre, rotation in zip(self.shape_ids, *self.poses(), strict=True):
             # Turn the world's "up" into the shape's own frame, where `points` are given. World ->
@@ -870,7 +870,7 @@ def greedy_plan(available: Sequence[int]) -> list[int]:
     """Positions in `available` of at most ten shapes, in order, for a high tower.
 
     The shapes with flat top and bottom, largest first, then the tallest of the rest. All over one
-    cylinder they reach a mean height of 5.1 to 5.4; random play reaches 1.5 to 1.6.
+    cylinder they reach 5.1 to 5.4 on average, by the split; random play reaches 1.5 to 1.6.
     """
 
     def rank(k):  # what is smaller comes first
@@ -886,7 +886,7 @@ def greedy_plan(available: Sequence[int]) -> list[int]:
 def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, list]:
     """One episode of 1D Place without stopping: the height, and the frames."""
     obs, _ = env.reset(seed=seed)
-    if policy == "greedy":  # all over the left cylinder, which may stand a little beyond -1
+    if policy == "greedy":  # over the left cylinder; in landing it may move just beyond -1
         positions, _ = env.poses()
         choices = greedy_plan(obs["available"])
         places = np.full((MAX_STEPS, 1), max(-1, positions[0, 0]))

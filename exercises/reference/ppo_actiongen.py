@@ -35,10 +35,10 @@ then what surrounds them: which actions are available, checks, the run's folder,
 
 Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
 A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
-f_omega(s). A step is one action of one environment. A *score* is what the environment's METRIC
-names in the last info of an episode (success, click-through rate, height). Two marks: [code] is the
-authors' released program, followed where the appendix is silent (a comment says so where the two
-disagree); [here] is a choice of this repository, with its reason.
+f_omega(s). A step is one action of one environment. A *score* is the entry of an episode's last
+info whose key is METRIC in the environment's file (success, click-through rate, height). Two marks:
+[code] is the authors' released program, followed where the appendix is silent (a comment says so
+where the two disagree); [here] is a choice of this repository, with its reason.
 """
 
 import atexit
@@ -150,7 +150,7 @@ class Args:
     # --- run ---
     runs_dir: str = "runs"  # folder of runs and representations
     run_name: str | None = None  # name of the run's folder; None: see run_name_of
-    resume: bool = False  # go on from the last checkpoint, bit for bit
+    resume: bool = False  # go on from the last checkpoint, bit for bit on the same device
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
     def __post_init__(self):
@@ -173,7 +173,7 @@ TABLE_3 = {
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
-    # As in [code], but for stacking: 40 there cannot tell checkpoints apart, so 200 [here].
+    # As in [code], except stacking's: its 40 cannot tell checkpoints apart, so 200 [here].
     "valid_episodes": (640, 160, 640, 200),
 }
 # Each column of the table, put over the defaults of Args, is the recipe of one environment.
@@ -216,7 +216,7 @@ FAST = {
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
         hidden_size=256,  # which tool, and where: more to represent
-        minibatch_size=128,  # pictures are the cost, so many small updates ...
+        minibatch_size=128,  # pictures through layers are the cost, not updates: so many, small ...
         num_minibatches=16,
         update_epochs=1,  # ... but each picture is used once: four passes move the policy too far
         learning_rate=5e-4,  # smaller minibatches are noisier
@@ -229,7 +229,7 @@ FAST = {
         eval_every=102_400,
     ),
     "stacking": dict(
-        published_init=False,  # as in Grid World; and towers do not stop at once
+        published_init=False,  # as in Grid World; and "stop" starts unlikely
         lr_decay_steps=None,  # as in CREATE
         minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
         clip_vloss=False,  # heights, too, are large against clip_coef
@@ -301,7 +301,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of one stream, named by the run's seed, its use and, while training, the step."""
+    """`n` seeds of one stream, named by the run's seed, its use, in training step and rank."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -340,7 +340,7 @@ def cnn(frames, H, small):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
         # [code] keeps PyTorch's initial weights, so small that all pictures have nearly the same
         # features at first. A run of a few million steps would lose time over it: with
-        # --small-pictures (no other option changes the convolutions) they are larger [here].
+        # --small-pictures they are larger [here]. (Stacking, at full size, keeps [code]'s.)
         if small:
             layer_init(conv)
         layers += [conv, nn.ReLU()]
@@ -459,9 +459,9 @@ class Agent(nn.Module):
         dims = self.action_parts["position"].shape[0]
         if not self.args.aux_conditioned:  # D.3.2: linear, from the state's encoding; gain 1 [code]
             return layer_init(nn.Linear(H, dims), 1.0)
-        # C.4: two layers, from the state's encoding and the projected action (B, 2H). With a gain
-        # of 1 in the last one [code], each tool has its own favourite place before training; with
-        # 0.01 all start alike [here].
+        # C.4: two layers, from the state's encoding and the projected action (B, 2H). Gains of 1
+        # here and in action_project would give each tool its own favourite place before training.
+        # [code] has 0.01 there, [here] it is 0.01 in the last layer.
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -491,7 +491,7 @@ class Agent(nn.Module):
 
     def utility(self, encoding, available):
         """f_nu (D.3.2): encodings (B, H) and ids of available actions (B, K) -> logits (B, K)."""
-        if self.args.bilinear:  # [here] c . (M s + m); the layer utility_query has M and its bias m
+        if self.args.bilinear:  # [here] c . (M encoding + m); utility_query has M and m
             query = self.utility_query(encoding)  # (B, D)
             return torch.einsum("bd,bkd->bk", query, self.table[available])
 
@@ -772,8 +772,8 @@ def train(args):
     # but may differ in K: Grid World's fast recipe learns with 20 available actions, tests have 50.
     check(args)
     phases, train_ids = action_phases(args)
-    # Rank 0 makes the run's folder and, if there is no table of representations yet, trains the
-    # encoder. All others wait here, and receive both.
+    # Step 1. Rank 0 makes the run's folder and, if there is no table of representations yet, trains
+    # the encoder. All others wait here, and receive both.
     made = (claim_folder(args), load_table(args)) if RANK == 0 else None
     folder, table = gather_from_all(made)[0]
 
@@ -809,7 +809,7 @@ def train(args):
     while step < last_step:
         started = time.perf_counter()
         if starts_afresh:
-            # At the beginning and after every checkpoint, all random numbers and all episodes start
+            # Step 2. At first and after every checkpoint, all random numbers and all episodes start
             # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
             # Episodes still running are dropped. Nothing is lost: the last iteration has learned
             # from them, with `next_value` (below) in place of what was to come.
@@ -830,9 +830,9 @@ def train(args):
         # has to read the representations. (--no-subsample: always the same set.)
         batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
 
-        # Judge. Rewards are divided by the standard deviation of a running return, so that values
-        # have one size in all environments, and clipped [code]. Not so with pictures [code]: there
-        # the values of CREATE reach 10, which is why its fast recipe has another vf_coef.
+        # Judge. Unless states are pictures, rewards are divided by the standard deviation of a
+        # running return, so that values are of the order of 1, and clipped [code]. With pictures
+        # they stay: values of CREATE reach 10, which is why its fast recipe has another vf_coef.
         rewards = batch["reward"]
         if not agent.is_image:
             returns, G = running_returns(rewards, batch["done"], G, args.gamma)
@@ -857,7 +857,7 @@ def train(args):
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
         # with actions which neither encoder nor policy was trained on. Test actions do not select:
-        # the best of many noisy scores is optimistic, so the one that is reported must be another.
+        # the best of many noisy scores is optimistic, so the reported one must be of other actions.
         # (Only the oracle encoder, hvae-all, was trained on all actions.)
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
@@ -906,7 +906,7 @@ def train(args):
 def evaluate(agent, phase, episodes, stream):
     """The frozen policy with actions of a phase, (action_pool, K): means over `episodes` episodes.
 
-    Nothing is learned here; new actions only bring their rows of the table. Every episode has its
+    Nothing is learned here; for new actions other rows of the table are read. Every episode has its
     own K of them (or all). Actions are drawn, as in training, not the likeliest taken [code].
     `stream` names the random numbers, see `seeds`. Returns score, its standard error over episodes
     (published error bars are over 5 seeds, 8 in Grid World, instead), return, length, episodes.
@@ -1020,7 +1020,7 @@ def load_table(args):
     if args.finetune:  # the policy goes on with the table it knows
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
     # Representations made by hand: an environment computes them from what it knows of its actions.
-    # Grid World has variants: "engineered-5d" is its five moves as five numbers (appendix B).
+    # Grid World's hold the moves and their sum [code]; "engineered-5d": five numbers (appendix B).
     if args.representation.startswith("engineered"):
         module = hvae.load_environment(args.env)
         options = {}
@@ -1108,7 +1108,7 @@ def check(args):
 
 # ---- the run's folder ----
 
-FREE = ("runs_dir", "run_name", "resume", "device")  # these do not make another run
+FREE = ("runs_dir", "run_name", "resume", "device")  # may differ at --resume, not in the name
 TESTED = {"train": "seen", "valid": "validation", "test": "unseen"}  # phases and their titles
 
 
@@ -1254,7 +1254,7 @@ def finish(folder, agent, phases, step, seconds):
 
 def plot_curve(folder, metric):
     """C.7, Figure 14: scores over steps, as measured ([code] draws the best score so far)."""
-    # With the same K, the distance between the two lines is what the policy has learned by heart.
+    # With the same K, the distance between the two lines is the generalisation gap.
     os.environ.pop("MPLBACKEND", None)  # a notebook's makes the import fail
     from matplotlib.figure import Figure  # not pyplot, which looks for a display
 
@@ -1271,7 +1271,7 @@ def plot_curve(folder, metric):
 
 def record_episode(agent, phase, path):
     """Play one episode and save it as a GIF, in colour."""
-    # The environment's class is the one that its file defines. It stands alone, in this process,
+    # The environment's class is the one that its file defines. It is a single one, in this process,
     # and is not reset at the end of the episode, or its last pictures would be lost.
     module = hvae.load_environment(agent.args.env)
     classes = [x for x in vars(module).values() if isinstance(x, type) and issubclass(x, gym.Env)]
@@ -1300,7 +1300,7 @@ class EvaluateArgs:
     actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
     num_available: int | None = None  # K; None: as in the run's own test
     min_angle_gap: float | None = None  # CREATE: only tools this many degrees from training tools
-    min_embedding_distance: float | None = None  # a share; .3: without the nearest 30 %
+    min_embedding_distance: float | None = None  # .3: leave out the 30 % nearest to training ones
     unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
     episodes: int = 5000  # episodes to play
     save: bool = False  # append the scores to evaluations.csv in the run's folder
