@@ -9,10 +9,9 @@ TABLE is the whole matrix: figure -> row -> command. A command's first word says
 environment (a training), `evaluate` (a test of a finished training) or `hvae` (an encoder). {row}
 in a command is the folder, or the table, of another row, {figure/row} that of another figure's;
 these come along. What is finished is not run again, what was stopped goes on from its checkpoint,
-and rows of several figures that are the same run share it. Nothing starts from a command that
-failed. Scores go to results/<figure>.csv, one row per run and phase, learning curves to
-results/<figure>_curves.csv; with --recipe paper to <figure>-paper.csv, since two recipes never
-share a table. benchmarks/report.py draws them.
+and rows of several figures that are the same run share it. Scores go to results/<figure>.csv,
+one row per run and phase, learning curves to results/<figure>_curves.csv; with --recipe paper to
+<figure>-paper.csv, since two recipes never share a table. benchmarks/report.py draws them.
 """
 
 import csv
@@ -42,9 +41,8 @@ from hvae import UserError  # noqa: E402
 
 # ---- which commands make which row ----
 
-# Rows have the names of results/published_results.csv, in which "ours" is HVAE + utility, so that
-# measured and published scores join. They hold their method's own flags and nothing else: --recipe
-# paper is Tables 3 and 4 but for these.
+# Rows have the names of results/published_results.csv ("ours": HVAE + utility), which they join,
+# and their method's own flags; --recipe paper is Tables 3 and 4 but for these.
 
 CREATE = "create"  # how every training in CREATE begins; options for all of its rows stand here
 TASKS = ("push", "seesaw", "obstacle")  # CREATE's in the main paper
@@ -59,8 +57,7 @@ ABLATIONS = {
 }
 FIGURE_8 = ABLATIONS | {"non_hierarchical_vae": "--representation vae"}
 METHODS = FIGURE_8 | {"oracle_encoder_all_actions": "--representation hvae-all"}
-# A.2 gives the representations, so there is no encoder to compare. "ours" is D.3.2's utility with
-# Table 4's units; the fast recipe's is bilinear [here].
+# A.2 gives the representations: no encoder to compare. "ours": D.3.2's utility, Table 4's units.
 RECSYS = {name: f"--no-bilinear --hidden-size 64 {flags}" for name, flags in ABLATIONS.items()}
 RECSYS["ours_bilinear"] = "--bilinear"
 ENGINEERED = {"engineered": "--representation engineered"}
@@ -126,8 +123,7 @@ TABLE = {
     "table1": rows(f"{CREATE} --task TASK", {"ours": ""} | FULL_SPLIT, TASKS),
     "analysis": rows(f"{CREATE} --task TASK", ANALYSIS, TASKS),
     "analysis-angle": rows(TEST, vary("min-angle-gap", 15, 12, 9, 6, 3), TASKS),
-    # Published: squared distances 0.5 .. 5, which depend on the scale of one encoder's table.
-    # [here] the share of unseen tools that are too near to a training tool: 0 .. 0.9.
+    # Published: squared distances in one encoder's table. [here] the share of too near ones.
     "analysis-embedding": rows(
         TEST, vary("min-embedding-distance", *(f"0.{q}" for q in range(10))), TASKS
     ),

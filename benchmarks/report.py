@@ -63,9 +63,8 @@ ENVIRONMENTS = {  # title, what a score is
     "create": ("CREATE", "success rate"),
     "stacking": ("Shape Stacking", "height"),
 }
-# The best score that unseen actions allow, with the K of Table 3, where it is known. Grid World:
-# exact search; all but 1 in 7,000 sets of skills allow a path. Recommender: greedy play by a policy
-# that is told the user, but not the popularity of unseen products (unless it is in the vector).
+# The best that unseen actions allow. Grid World: all but 1 in 7,000 sets of skills allow a path.
+# Recommender: greedy play, told the user, but the popularity only if it is in the vector.
 CEILINGS = {"gridworld": 1.0, "recsys": 0.301, "recsys_full": 0.659}
 ANALYSES = {  # figure -> its name in published_analyses.csv ("": in other units), what is varied
     "analysis-angle": ("angle", "least angle to a training tool, degrees"),
@@ -86,6 +85,7 @@ for file, key in (("results", "env task method phase"), ("analyses", "analysis t
         PUBLISHED[tuple(row[name] for name in key.split())] = numbers
 LOOK = {"font.size": 8, "axes.titlesize": 8.5, "axes.titlelocation": "left"}
 LOOK |= {"axes.spines.top": False, "axes.spines.right": False}
+LEGEND = dict(loc="outside lower center", frameon=False)
 
 Place = tuple[str, str, int]  # env, task ("" without one), number of steps
 Cells = dict[tuple[Place, str], dict[str, list[float]]]  # place, method -> phase -> its seeds
@@ -200,12 +200,6 @@ def canvas(count: int, columns: int, width: float, height: float, **options):
     return figure, axes.flat[:count]
 
 
-def save(figure, path: Path, key: dict, columns: int) -> None:
-    """Write a picture with its legend."""
-    figure.legend(key.values(), key, loc="outside lower center", ncols=columns, frameon=False)
-    hvae.write(path, partial(figure.savefig, format="png", dpi=110))
-
-
 def draw_bars(path: Path, cells: Cells) -> None:
     """Per method: unseen actions full, seen ones pale, published outlined, seeds as dots."""
     from matplotlib.lines import Line2D
@@ -237,7 +231,8 @@ def draw_bars(path: Path, cells: Cells) -> None:
                 axis.barh(at, theirs or 0, 0.36, **outline)
     axes[0].set_yticks(range(len(methods)), [names(places[0], method)[1] for method in methods])
     axes[0].invert_yaxis()
-    save(figure, path, key, 5)
+    figure.legend(key.values(), key, ncols=5, **LEGEND)
+    hvae.write(path, partial(figure.savefig, format="png", dpi=110))
 
 
 def draw_lines(path: Path, panels: dict, xlabel: str, columns=3, width=3.1) -> None:
@@ -257,7 +252,8 @@ def draw_lines(path: Path, panels: dict, xlabel: str, columns=3, width=3.1) -> N
         axis.set_ylim(0, None)
     for axis in axes[-columns:]:
         axis.set_xlabel(xlabel)
-    save(figure, path, key, 3)
+    figure.legend(key.values(), key, ncols=3, **LEGEND)
+    hvae.write(path, partial(figure.savefig, format="png", dpi=110))
 
 
 def lines_of(figure: str, cells: Cells, zero: dict[Place, float]) -> dict[str, list[tuple]]:
@@ -301,7 +297,7 @@ def section(name: str, draw: bool) -> str:
     rows = [row for file in files for row in rows_of(file)]
     if not rows:
         return ""
-    text = picture = None
+    picture = text = None
     if name == "fig14":
         seen = group(rows, "step", "train_score", True)
         panels = {}  # a method's longest runs come last, and stay
@@ -341,11 +337,7 @@ def section(name: str, draw: bool) -> str:
 
 
 def main(check: bool = False) -> None:
-    """Draw everything there are results for, and write both pages.
-
-    Args:
-        check: change nothing, exit 1 where a page disagrees with the CSV files.
-    """
+    """Draw everything there are results for, and write both pages; or only `check` them."""
     figures = [name for name in TABLE if name != "analysis"]  # no result of its own
     names = ["main", *figures, *(f"{name}-paper" for name in figures), "fig14"]
     with matplotlib.rc_context(LOOK):  # for these pictures only
