@@ -3,7 +3,7 @@
 An action is known only by observations of what it does: a set X = {x_1 .. x_n} of trajectories,
 videos or pictures. One latent c explains what the set shares (the action), a latent z_j what is
 special to x_j (a ball's launch, a camera angle). The first state s_j of x_j is not predicted but
-given to the decoder (a picture has none). With a draw of c ~ q(c | X), z_j ~ q(z_j | x_j, c):
+given to the decoder (a picture has none). Model; bound, with c ~ q(c | X), z_j ~ q(z_j | x_j, c):
 
         c ~ N(0, I)  ->  z_j ~ p(z | c)  ->  x_j ~ p(x | z_j, c, s_j)
     ELBO per observation = mean_j [ log p(x_j | z_j, c, s_j) - KL(q(z_j | x_j, c) || p(z_j | c)) ]
@@ -12,14 +12,14 @@ given to the decoder (a picture has none). With a draw of c ~ q(c | X), z_j ~ q(
 Only `--recipe paper` uses this weight of the last term; the shorter recipes, quick and fast, divide
 it by more than |X| (`kl_c_divisor`). The representation of an action is the mean of q(c | X). The
 networks learn from training actions and CREATE's no-op; with `--train-on all`, the oracle encoder,
-from all of the split. The last update's weights count. Then every action of the split and the no-op
-get a row of a table, without re-training. Actions in no part of the split keep a row of zeros.
+from all of the split. The weights after the last update are used: every action of the split and the
+no-op get a row of a table, without re-training. Actions in no part of the split keep zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
     python hvae.py gridworld --train-on all      # the oracle encoder: trained on all parts
     python hvae.py create --modality video       # B: videos; B's Full Split: --split full
-    python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU (--help shows them)
+    python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU (add --help: numbers)
     python hvae.py my_env.py                     # an environment of your own, in a file
 
 Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed SPLITS (names),
@@ -30,7 +30,7 @@ NO_OP (an id), UNITS (see `prepare`); and
     action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
 An observation is (L, F), L states of F numbers each; but of modality "onehot" (L, 2), a cell's x
-and y as whole numbers 0-79, at most 39 from the first and the last one; of "image" (S, S), "video"
+and y as whole numbers 0-79, at most 39 from the first and the previous; of "image" (S, S), "video"
 (L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on seed *and* id: several calls are
 made, each may start `workers` processes. Marks: "appendix:" that of Generalization to New Actions
 in Reinforcement Learning (ICML 2020); [code] the authors' program; [here] our choice, and why.
@@ -60,7 +60,7 @@ from tqdm import tqdm
 # of F numbers per trajectory, the first given, T = L - 1 predicted; C = Z sizes of c, z; H hidden
 # width; E of an encoded observation: H, or H + L * F with the linear path; S side of a picture.
 
-# Name on the command line -> module. (The Recommender needs no encoder: here for loading tables.)
+# Name on the command line -> module. (The Recommender, without encoder, is here to load tables.)
 ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
@@ -124,7 +124,7 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     # Grid World's raw cells run from 1 to 78, a move changes them by 1: the networks would first
     # have to learn to subtract. Differences show the skill from the first update.
     "relative":            (True,  True,  False),
-    # A Bi-LSTM of half the width has a third of the weights or fewer, 0.6 of the time of an update.
+    # A Bi-LSTM of half the width has 0.26 to 0.35 of the weights, 0.6 of the time of an update.
     "compact_lstm":        (True,  True,  False),
     # RAdam moves a parameter by about the learning rate per update at most: 1e-3 is too slow for a
     # log-variance that starts near 0 and has to fall to the clamp at -4 (ObservationModel.forward).
@@ -161,7 +161,7 @@ EXCEPTIONS = {
         "linear_path":         (True,  True,  False),
     },
 }
-# appendix: Tables 3-4 have one column for all of CREATE; [code] its videos have the numbers of
+# appendix: Table 3 has one column for all of CREATE; [code] its videos have the numbers of
 # Shape Stacking's pictures; [here] as the code. 1,024 videos of every tool are 35 GB.
 EXCEPTIONS["video"] = EXCEPTIONS["image"] | {
         "updates":             (200,   600,   0),
@@ -286,7 +286,7 @@ class SumReLU(nn.Module):
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
-    # D.3.1: "1D batch-norm"; [code] this, also epsilon and momentum. A norm per dimension stretches
+    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. One per dimension stretches
     # an unused dimension of c to variance 1 at first; a shared one lets it stay near 0 (KL 0).
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
@@ -307,7 +307,7 @@ def initialise(module):
         nn.init.zeros_(module.bias)
 
 
-# Keys: height = width of a picture. Of videos it is 84 in B, 48 in A.3, D.3.1 and [code].
+# Keys: height = width of a picture. Of videos it is 84 in B; 48 in A.3, D.3.1, [code] and [here].
 ENCODER_LAYERS = {48: 7, 84: 9}
 ENCODER_CHANNELS = (8, 8, 16, 16, 16, 16, 32, 32, 32)  # [code] after each layer
 DECODER_SIDES = {48: (6, 12, 24, 48), 84: (6, 11, 21, 42, 84)}  # [code] after each stage
@@ -356,7 +356,7 @@ class ActionInference(nn.Module):
         self.norm = GlobalBatchNorm()  # [code] over mean and log-variance together
 
     def forward(self, h):
-        # A mean ignores the order, and how many there are: 4 in training, 64 or 1,024 at the end.
+        # A mean ignores the order and takes any number: few in training, at the end all recorded.
         pooled = self.before(h).mean(1)  # (A, n, H) -> (A, H)
         return normal(*self.norm(self.after(pooled)).chunk(2, -1))  # (A, 2C) -> twice (A, C)
 
@@ -364,7 +364,7 @@ class ActionInference(nn.Module):
 class ObservationInference(nn.Module):
     """Observation Inference Network: encoded x (B, E), c (B, C) -> q(z | x, c), Gaussian (B, Z)."""
 
-    # Only in [code]: the batch norm; for p(z | c) a second such network, without x. VAE: without c.
+    # Not in D.3.1 but [code]: the batch norm; for p(z | c) a second network, without x. VAE: no c.
     def __init__(self, inputs, hidden, size):
         super().__init__()
         self.sum = SumReLU(inputs, hidden)
@@ -422,7 +422,7 @@ def conv_decoder(side, mask):
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
         # Channel 0 is the picture, 1 its mask (see decode). Untrained pictures are grey: worse than
-        # the first frame, so the mask would fall to 0. [here] The picture starts white, at .95.
+        # the first frame, so the mask would fall to 0. [here] It starts white, like most of it.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -498,7 +498,7 @@ class ObservationModel(nn.Module):
         if self.args.modality == "image":
             return picture
         # Temporal skip connection: where the mask is 0, the first frame shows through. appendix:
-        # mask * picture + frame; [code] as below; [here] as the code: a sum can leave the greys.
+        # mask * picture + frame; [code] as below; [here] as the code: a sum can leave [-0.5, 0.5].
         mask = pixels[:, :, 1:]
         return mask * picture + (1 - mask) * frame
 
@@ -755,7 +755,7 @@ def action_set(module):
 def save_representation(path, mean, action_ids, config: dict) -> Path:
     """Write a table that `load_representation` accepts, whoever made it; return its path."""
     # mean: (NUM_ACTIONS, D), finite. action_ids: those the encoder was trained on, or []. config:
-    # for JSON, with "env"; "split", "split_seed" are checked at loading. UserError if it is wrong.
+    # for JSON, with "env"; "split", "split_seed" are checked at loading. UserError: bad mean or env.
     path = Path(path)
     module = load_environment(str(config.get("env")))  # without one: unknown environment 'None'
     mean = np.asarray(mean, np.float32)
@@ -791,7 +791,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
 
 
 def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
-    """How well known facts can be read off held-out rows, by models fitted on training rows."""
+    """How well held-out rows show known facts; all but nn_class by fits on training rows."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
     from sklearn.pipeline import make_pipeline
@@ -809,7 +809,7 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     # 0.970, 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
     scores = {}
     if environment_name(env) == "gridworld":
-        net = features[:, :2]  # [code], not B: the net displacement, -5..5
+        net = features[:, :2]  # [code] (B: five moves only): -5..5
         logistic = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000))
         scores["net_r2"] = score(ridge, net)
         scores["move_accuracy"] = np.mean([score(logistic, m) for m in module.SKILL_MOVES.T])
