@@ -755,7 +755,7 @@ def action_set(module):
 def save_representation(path, mean, action_ids, config: dict) -> Path:
     """Write a table that `load_representation` accepts, whoever made it; return its path."""
     # mean: (NUM_ACTIONS, D), finite. action_ids: those the encoder was trained on, or []. config:
-    # for JSON, with "env"; "split", "split_seed" are checked at loading. UserError: bad mean or env.
+    # for JSON, with "env"; "split", "split_seed" are checked at loading. UserError: bad mean, env.
     path = Path(path)
     module = load_environment(str(config.get("env")))  # without one: unknown environment 'None'
     mean = np.asarray(mean, np.float32)

@@ -150,7 +150,7 @@ class Args:
     # --- run ---
     runs_dir: str = "runs"  # folder of runs and representations
     run_name: str | None = None  # name of the run's folder; None: see run_name_of
-    resume: bool = False  # go on from the last checkpoint, bit for bit on the same device
+    resume: bool = False  # go on from the last checkpoint, bit for bit on one kind of CPU
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
     def __post_init__(self):
@@ -216,7 +216,7 @@ FAST = {
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
         hidden_size=256,  # which tool, and where: more to represent
-        minibatch_size=128,  # pictures through layers are the cost, not updates: so many, small ...
+        minibatch_size=128,  # pictures, not updates, are the cost: so many small minibatches ...
         num_minibatches=16,
         update_epochs=1,  # ... but each picture is used once: four passes move the policy too far
         learning_rate=5e-4,  # smaller minibatches are noisier
@@ -301,7 +301,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of one stream, named by the run's seed, its use, in training step and rank."""
+    """`n` seeds of one stream, named by the run's seed, its use; in training, step and rank."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -345,7 +345,7 @@ def cnn(frames, H, small):
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # each tool in the picture makes all features larger; that says little, so it goes
+    if small:  # each tool in a picture makes all features larger: this common size is divided out
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -460,8 +460,8 @@ class Agent(nn.Module):
         if not self.args.aux_conditioned:  # D.3.2: linear, from the state's encoding; gain 1 [code]
             return layer_init(nn.Linear(H, dims), 1.0)
         # C.4: two layers, from the state's encoding and the projected action (B, 2H). Gains of 1
-        # here and in action_project would give each tool its own favourite place before training.
-        # [code] has 0.01 there, [here] it is 0.01 in the last layer.
+        # in action_project, `hidden` and `last` would give each tool a favourite place before
+        # training. One of 0.01 prevents it: action_project's in [code], else that of `last` [here].
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -862,7 +862,7 @@ def train(args):
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
-            stream = (args.seed, VALIDATION, step)  # one for both: only the actions differ
+            stream = (args.seed, VALIDATION, step)  # one for both: only their actions differ
             train_score = evaluate(agent, phases["train"], args.valid_episodes, stream)["score"]
             valid_score = train_score  # C.2 has no actions but those that it adapts to
             if not args.adapt:
