@@ -27,8 +27,8 @@ C.3 `--no-subgoal-reward`; C.4 `--[no-]aux-conditioned`; C.5 `--fully-observable
     python ppo_actiongen.py my_env.py                 # an environment of your own: see README.md
     python ppo_actiongen.py evaluate runs/gridworld-s0 --num-available 20  # see evaluate --help
 
-In the order of this file: hyper-parameters (the policy's in Tables 3 and 4, without what the
-environments fix: how long episodes are, what a state holds); torchrun; random numbers; networks
+In the order of this file: hyper-parameters (the policy's rows of Tables 3 and 4, except the length
+of episodes and the observation, which the environments fix); torchrun; random numbers; networks
 (D.3.2, C.4); the main paper's Algorithm 1, training, and Algorithm 2, acting with unseen actions;
 then what surrounds them: which actions are available, checks, the run's folder, the command
 `evaluate` (A.3), the command line.
@@ -168,12 +168,12 @@ TABLE_3 = {
     "representation": ("hvae", "engineered", "hvae", "hvae"),  # A.2: recsys provides them
     "task": (None, None, "push", None),
     "placement": (None, None, None, "1d"),
-    # D.2: the rate falls linearly over the training. [code] agrees for two of the environments. For
-    # the others it takes longer than the run, so theirs end at .46 and .97 of the initial rate.
+    # D.2: the rate falls linearly over the training. In CREATE and Stacking it takes longer [code],
+    # so their runs end at .46 and .97 of the rate; followed here, as published scores come from it.
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
-    # As in [code], except stacking's: its 40 cannot tell checkpoints apart, so 200 [here].
+    # As in [code]; but for Stacking 200, not 40, which cannot tell checkpoints apart [here].
     "valid_episodes": (640, 160, 640, 200),
 }
 # Each column of the table, put over the defaults of Args, is the recipe of one environment.
@@ -216,15 +216,15 @@ FAST = {
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
         hidden_size=256,  # which tool, and where: more to represent
-        minibatch_size=128,  # pictures, not updates, are the cost: so many small minibatches ...
+        minibatch_size=128,  # convolutions cost per picture, not per update: so many small ones
         num_minibatches=16,
-        update_epochs=1,  # ... but each picture is used once: four passes move the policy too far
+        update_epochs=1,  # four passes over the same pictures move the policy too far
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
-        ent_floor=0.1,  # as in Grid World
+        ent_floor=0.1,  # late in training a random tool can spoil the episode
         clip_coef=0.2,  # goals are rare, so each of them may teach more
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
-        clip_vloss=False,  # changes of clip_coef are too small for values near 10
+        clip_vloss=False,  # a value could move by clip_coef only, too little near 10
         total_timesteps=4_000_000,
         eval_every=102_400,
     ),
@@ -232,7 +232,7 @@ FAST = {
         published_init=False,  # as in Grid World; and "stop" starts unlikely
         lr_decay_steps=None,  # as in CREATE
         minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
-        clip_vloss=False,  # heights, too, are large against clip_coef
+        clip_vloss=False,  # as in CREATE: heights, too, are large against clip_coef
         total_timesteps=400_000,
         eval_every=20_480,
     ),
@@ -301,7 +301,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of one stream, named by the run's seed, its use; in training, step and rank."""
+    """`n` seeds of a stream: (run's seed, use), where needed followed by the step and the rank."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -459,9 +459,10 @@ class Agent(nn.Module):
         dims = self.action_parts["position"].shape[0]
         if not self.args.aux_conditioned:  # D.3.2: linear, from the state's encoding; gain 1 [code]
             return layer_init(nn.Linear(H, dims), 1.0)
-        # C.4: two layers, from the state's encoding and the projected action (B, 2H). Gains of 1
-        # in action_project, `hidden` and `last` would give each tool a favourite place before
-        # training. One of 0.01 prevents it: action_project's in [code], else that of `last` [here].
+        # C.4: two layers, from the state's encoding and the projected action (B, 2H). If all three
+        # layers, action_project, `hidden` and `last`, had a gain of 1, each untrained tool would
+        # have a favourite place. So one of them gets 0.01: with published_init action_project
+        # [code], without it `last` [here].
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -772,8 +773,8 @@ def train(args):
     # but may differ in K: Grid World's fast recipe learns with 20 available actions, tests have 50.
     check(args)
     phases, train_ids = action_phases(args)
-    # Step 1. Rank 0 makes the run's folder and, if there is no table of representations yet, trains
-    # the encoder. All others wait here, and receive both.
+    # 1. of Algorithm 1. Rank 0 makes the run's folder and, if there is no table of representations
+    # yet, trains the encoder. All others wait here, and receive both.
     made = (claim_folder(args), load_table(args)) if RANK == 0 else None
     folder, table = gather_from_all(made)[0]
 
@@ -806,10 +807,11 @@ def train(args):
     eval_steps = max(1, args.eval_every // rollout_size) * rollout_size
     decay_steps = args.lr_decay_steps or args.total_timesteps
     starts_afresh = True
+    # 2. of Algorithm 1. Collect, judge, learn, now and then select.
     while step < last_step:
         started = time.perf_counter()
         if starts_afresh:
-            # Step 2. At first and after every checkpoint, all random numbers and all episodes start
+            # At first and after every checkpoint, all random numbers and all episodes start
             # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
             # Episodes still running are dropped. Nothing is lost: the last iteration has learned
             # from them, with `next_value` (below) in place of what was to come.
@@ -832,7 +834,7 @@ def train(args):
 
         # Judge. Unless states are pictures, rewards are divided by the standard deviation of a
         # running return, so that values are of the order of 1, and clipped [code]. With pictures
-        # they stay: values of CREATE reach 10, which is why its fast recipe has another vf_coef.
+        # they stay, for no known reason [code]; so CREATE's fast recipe has another vf_coef.
         rewards = batch["reward"]
         if not agent.is_image:
             returns, G = running_returns(rewards, batch["done"], G, args.gamma)
@@ -1108,7 +1110,7 @@ def check(args):
 
 # ---- the run's folder ----
 
-FREE = ("runs_dir", "run_name", "resume", "device")  # may differ at --resume, not in the name
+FREE = ("runs_dir", "run_name", "resume", "device")  # may differ at --resume; no part of the name
 TESTED = {"train": "seen", "valid": "validation", "test": "unseen"}  # phases and their titles
 
 
@@ -1271,8 +1273,8 @@ def plot_curve(folder, metric):
 
 def record_episode(agent, phase, path):
     """Play one episode and save it as a GIF, in colour."""
-    # The environment's class is the one that its file defines. It is a single one, in this process,
-    # and is not reset at the end of the episode, or its last pictures would be lost.
+    # The environment's class is the one that its file defines. One such environment is made, in
+    # this process, and not reset at the end of the episode, or its last pictures would be lost.
     module = hvae.load_environment(agent.args.env)
     classes = [x for x in vars(module).values() if isinstance(x, type) and issubclass(x, gym.Env)]
     own = [x for x in classes if x.__module__ == module.__name__]
