@@ -19,7 +19,7 @@ no-op get a row of a table, without re-training. Actions in no part of the split
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
     python hvae.py gridworld --train-on all      # the oracle encoder: trained on all parts
     python hvae.py create --modality video       # B: videos; B's Full Split: --split full
-    python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU (add --help: numbers)
+    python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU (--help lists it)
     python hvae.py my_env.py                     # an environment of your own, in a file
 
 Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed SPLITS (names),
@@ -30,10 +30,10 @@ NO_OP (an id), UNITS (see `prepare`); and
     action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
 An observation is (L, F), L states of F numbers each; but of modality "onehot" (L, 2), a cell's x
-and y as whole numbers 0-79, at most 39 from the first and the previous; of "image" (S, S), "video"
-(L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on seed *and* id: several calls are
-made, each may start `workers` processes. Marks: "appendix:" that of Generalization to New Actions
-in Reinforcement Learning (ICML 2020); [code] the authors' program; [here] our choice, and why.
+and y as whole numbers 0-79, at most 39 from those of the first state and of the one before; of
+"image" (S, S), "video" (L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on seed *and*
+id: several calls are made, each may start `workers` processes. Marks: [code] the authors' program;
+[here] our choice, and why; "appendix:" that of Generalization to New Actions in RL (ICML 2020).
 """
 
 import hashlib
@@ -58,7 +58,7 @@ from tqdm import tqdm
 # Table 4's "MLP hidden layers 3" is no option: D.3.1 gives each MLP its own depth.
 # Shapes: A actions in a batch, N recorded observations of each, n in an update, B = A * n; L states
 # of F numbers per trajectory, the first given, T = L - 1 predicted; C = Z sizes of c, z; H hidden
-# width; E of an encoded observation: H, or H + L * F with the linear path; S side of a picture.
+# width; E of an encoded observation: H, or H + L * F with --linear-path; S side of a picture.
 
 # Name on the command line -> module. (The Recommender, without encoder, is here to load tables.)
 ENVIRONMENTS = dict(
@@ -98,7 +98,7 @@ class Args:
     kl_warmup: float = 0.0  # share of the updates in which the weight of the KLs climbs to 1
     compact_lstm: bool  # a Bi-LSTM of half the width, directions concatenated (none in pictures)
     log_var_start: float | None  # initial log-variance of the decoder (None: from N(0, 1))
-    log_var_rate: float  # factor on the learning rate of learned log-variances (all but q(c|X)'s)
+    log_var_rate: float  # factor on the rate of log-variances that are weights (not q(c|X)'s)
 
 
 # ---- Tables 3 and 4 ----
@@ -217,7 +217,7 @@ def default_args(env: str, recipe: str = "fast", modality: str | None = None) ->
     return Args(env=env, modality=modality, recipe=recipe, **numbers)
 
 
-# ---- observations as the networks see them (B) ----
+# ---- observations as the networks see them (appendix B) ----
 
 
 def prepare(raw, args):
@@ -247,8 +247,8 @@ def prepare(raw, args):
     if not args.relative:
         return raw, later
     # UNITS, a dictionary: first states become (x - centre) / half_width; all else is divided by
-    # `step`. Two actions should differ by more than 0.135 steps: the decoder's log-variance is
-    # clamped at -4 (ObservationModel.forward), so its sigma is at least exp(-4 / 2) = 0.135.
+    # `step`. States should differ between actions by more than 0.135 `step`: the decoder's
+    # log-variance is clamped at -4 (ObservationModel.forward), its sigma at exp(-4 / 2) = 0.135.
     units = getattr(load_environment(args.env), "UNITS", dict(centre=0, half_width=1, step=1))
     start = (first - units["centre"]) / units["half_width"]
     return torch.cat([start, moves / units["step"]], 1), (later - first) / units["step"]
@@ -286,8 +286,8 @@ class SumReLU(nn.Module):
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
-    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. One per dimension stretches
-    # an unused dimension of c to variance 1 at first; a shared one lets it stay near 0 (KL 0).
+    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. One per dimension would
+    # give an unused dimension of c a mean of variance 1, which costs KL; shared, it stays small.
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
@@ -399,8 +399,8 @@ class ObservationDecoder(nn.Module):
             return self.output(effect)[:, None]
         # By this product the start can cancel the effect: beside a wall, a move does nothing.
         gated = effect * self.start(start)  # (B, H)
-        # appendix: this vector drives the LSTM; [code] each predicted state is embedded and fed
-        # back in place of the start; [here] as the appendix, which also learns sooner.
+        # appendix: this vector is the LSTM's input, at every step; [code] the start is replaced by
+        # the state predicted last; [here] as the appendix, which also learns sooner.
         sequence = gated[:, None].expand(-1, self.steps, -1)  # (B, T, H)
         return self.output(self.lstm(sequence)[0])  # (B, T, F)
 
@@ -421,8 +421,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0 is the picture, 1 its mask (see decode). Untrained pictures are grey: worse than
-        # the first frame, so the mask would fall to 0. [here] It starts white, like most of it.
+        # Channel 0 is the picture, 1 its mask (see decode). An untrained picture is grey, worse
+        # than the first frame: the mask would fall to 0. [here] It starts white, like most pixels.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -479,7 +479,7 @@ class ObservationModel(nn.Module):
 
     def add_linear_path(self, q, h):
         # [here] The mean of c (VAE: of z) = Linear(h) + 0.1 * q.mean; the HVAE's h is averaged over
-        # the set. Why c does not collapse then is not known: found by trying.
+        # the set. Why this keeps c from collapsing is not known: found by trying.
         if self.path:
             q = Normal(self.path(h) + 0.1 * q.mean, q.stddev, validate_args=False)
         return q
@@ -552,8 +552,8 @@ class HVAE(ObservationModel):
 class VAE(ObservationModel):
     """The non-hierarchical baseline (B): encodes observations one by one, averages at the end."""
 
-    # [code] A quarter of the HVAE's updates, another initialisation, and the mean of 62 or 128
-    # observations; [here] trained as the HVAE, but kl_c_divisor weakens only the HVAE's KL of c.
+    # [code] A quarter of the HVAE's updates, another initialisation, representations from 62 or 128
+    # observations; [here] as the HVAE, but its KL has the ELBO's weight: it has no c to weaken.
     def __init__(self, args, shape):
         size = args.representation_size
         super().__init__(args, shape, latents=(size,))
@@ -791,7 +791,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
 
 
 def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
-    """How well held-out rows show known facts; all but nn_class by fits on training rows."""
+    """Scores of held-out rows: what known facts they tell, by fits on the training rows."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
     from sklearn.pipeline import make_pipeline
@@ -809,7 +809,7 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     # 0.970, 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
     scores = {}
     if environment_name(env) == "gridworld":
-        net = features[:, :2]  # [code] (B: five moves only): -5..5
+        net = features[:, :2]  # net displacement, -5..5, as in [code]; B has the five moves only
         logistic = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000))
         scores["net_r2"] = score(ridge, net)
         scores["move_accuracy"] = np.mean([score(logistic, m) for m in module.SKILL_MOVES.T])
