@@ -1,19 +1,19 @@
 """Action representations: a hierarchical VAE over sets of action observations (appendix B, D.3.1).
 
-An action is known only by observations of what it does: a set X = {x_1 .. x_n} of trajectories,
-videos or pictures. One latent c explains what the set shares (the action), a latent z_j what is
-special to x_j (a ball's launch, a camera angle). The first state s_j of x_j is not predicted but
-given to the decoder (a picture has none). Model; bound, with c ~ q(c | X), z_j ~ q(z_j | x_j, c):
+A policy reads of an action, known or new, a vector that is made from observations of what it does:
+a set X = {x_1 .. x_n} of trajectories, videos or pictures. One latent c explains what the set
+shares (the action), a latent z_j what is special to x_j (a ball's launch, a camera angle). The
+first state s_j of x_j is not predicted but given to the decoder (a picture has none). Model; bound,
+with c ~ q(c | X), z_j ~ q(z_j | x_j, c):
 
         c ~ N(0, I)  ->  z_j ~ p(z | c)  ->  x_j ~ p(x | z_j, c, s_j)
     ELBO per observation = mean_j [ log p(x_j | z_j, c, s_j) - KL(q(z_j | x_j, c) || p(z_j | c)) ]
                            - KL(q(c | X) || N(0, I)) / |X|
 
-Only `--recipe paper` uses this weight of the last term; the shorter recipes, quick and fast, divide
-it by more than |X| (`kl_c_divisor`). The representation of an action is the mean of q(c | X). The
-networks learn from training actions and CREATE's no-op; with `--train-on all`, the oracle encoder,
-from all of the split. The weights after the last update are used: every action of the split and the
-no-op get a row of a table, without re-training. Actions in no part of the split keep zeros.
+Only recipe paper divides the last term by |X|; quick and fast by more (`kl_c_divisor`). The
+representation of an action is the mean of q(c | X). The networks learn from training actions and
+CREATE's no-op; with `--train-on all`, the oracle encoder, from all of the split. After the last
+update every action of the split and the no-op get a row of a table. Actions in no part keep zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
@@ -131,11 +131,11 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     "log_var_start":       (-2.0,  -2.0,  None),
     "log_var_rate":        (10.0,  10.0,  1.0),
 }
-# They replace rows above or defaults of Args: the modality's or, if it has none, the environment's.
+# In place of rows above or defaults of Args. One entry counts: modality's, else environment's.
 EXCEPTIONS = {
     "onehot": {"updates": (2_000, 4_000, 0)},  # it takes longer to learn what 160 numbers mean
     # Without these changes the model ignored z (how the ball was launched): the squared error, in
-    # units of `step` (see prepare), stayed near 6.5; with all of them below 1. Not tried singly.
+    # units of `step` (see prepare), stayed near 6.5; with all it is below 1. Not tried singly.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
@@ -364,7 +364,7 @@ class ActionInference(nn.Module):
 class ObservationInference(nn.Module):
     """Observation Inference Network: encoded x (B, E), c (B, C) -> q(z | x, c), Gaussian (B, Z)."""
 
-    # Not in D.3.1 but [code]: the batch norm; for p(z | c) a second network, without x. VAE: no c.
+    # A second one, without x, is p(z | c) [code]; the VAE's is without c. The batch norm: [code].
     def __init__(self, inputs, hidden, size):
         super().__init__()
         self.sum = SumReLU(inputs, hidden)
@@ -553,7 +553,7 @@ class VAE(ObservationModel):
     """The non-hierarchical baseline (B): encodes observations one by one, averages at the end."""
 
     # [code] A quarter of the HVAE's updates, another initialisation, representations from 62 or 128
-    # observations; [here] as the HVAE, but its KL has the ELBO's weight: it has no c to weaken.
+    # observations; [here] as the HVAE. KL(q(z | x) || N(0, I)) has weight 1: no c to weaken.
     def __init__(self, args, shape):
         size = args.representation_size
         super().__init__(args, shape, latents=(size,))
