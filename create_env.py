@@ -7,7 +7,7 @@ the analyses. What a tool does is told by a probe ball that is launched at it (a
 
 In five of the tasks the target rests, and a second, blue ball, the *marker*, is there to knock it.
 There the goal counts only from the *target hit* on: the target has moved more than 3.56 units from
-its start, whatever moved it.
+its start, whatever moved it (in obstacle and cannon the marker must have touched it).
 
     python create_env.py --task push                # a GIF of the best of 400 random episodes
     python create_env.py --play --tools Fan Funnel  # place tools of these classes by mouse
@@ -95,7 +95,7 @@ BALL_RADIUS = 4.0  # [code] units: marker, goal and probe ball, and the target i
 BALL_MASS = 10.0  # [code]
 PLANK_MASS = 10.0  # [code] of levers and see-saws
 PLANK_MOMENT = 10_000.0  # [code] a rod of 20 units would have 333, so planks turn slowly
-LADDER_LEAN = 4.0  # [code] sideways a ladder carries so many times faster than its angle says
+LADDER_LEAN = 4.0  # [code] factor on the sideways speed of a ball on a ladder
 VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; not in engineered_representations
 
 METRIC = "success"  # the goal was reached in the episode (0 or 1)
@@ -160,7 +160,7 @@ RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# A corner points to the angle. At 45 degrees squares lie flat: [code]'s boxes, which no split has.
+# A corner points to the angle. No 45, squares that lie flat: [code]'s class of boxes, in no split.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. Planks and ball tools have no friction: [code] forgets to set it.
@@ -186,7 +186,7 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    # Never drawn or placed; a disc, because recordings of the probe ball begin around its touch.
+    # Never placed in a game. A recording begins around the probe ball's touch, so it needs a shape.
     "No-op": Kind("disc", GREEN, GOAL),
     # The tools in the order of their ids, which saved representations and runs rely on. Down to the
     # bucket they are those of the Default Split.
@@ -280,7 +280,7 @@ NUM_ACTIONS = len(TOOLS)  # 8,359 distinct tools over all splits
 TOOL_KINDS = np.array([tool.kind for tool in TOOLS])
 TOOL_ANGLES = np.array([tool.max_angle or tool.angle for tool in TOOLS])
 # Is it one of the tools 15 degrees apart (limits 5, 20, ...), not one that the analyses add? Modulo
-# 15, angles are 0, 3, .. 12 and limits 2, 5, .. 14: only coarse angles are 0, coarse limits 5.
+# 15, angles are 0, 3, .. 12, limits 2, 5, .. 14: so 0 is a coarse angle, 5 a coarse limit.
 IS_COARSE = np.isin(TOOL_ANGLES % COARSE_STEP, (0, FIRST_LIMIT))
 IS_COARSE |= np.isin(TOOL_KINDS, list(OWN_KINDS))
 
@@ -314,8 +314,8 @@ def engineered_representations() -> np.ndarray:
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
-# paper's main results come from this draw. Others may be harder: in C(19, 7) / C(24, 12) = 1.9 % of
-# them all five cannon angles from 120 to 180 degrees are for training. Then no test tool shoots up
+# paper's main results come from this draw (cannons: 12 of 24 angles). Others may be harder: C(19, 7)
+# / C(24, 12) = 1.9 % of draws have all five from 120 to 180 degrees. Then no test cannon shoots up
 # and well to the left, where most goals are.
 TRAINING_ANGLES = {
     ("Ramp", "Trampoline"): (45, 60, 75, 90, 105, 165),
@@ -517,7 +517,7 @@ TASKS = {
         subgoals=((0.7, -0.1),), walls=ROOM, marker_must_touch=True,
         target_hit_reward=2.0,  # appendix: 1; [code] 2; [here] as [code]
         max_actions=50),  # appendix: 30; [code] 50; [here] as [code], the published task
-    # The target has to get left of the wall. A see-saw closes the way until its left end is loaded.
+    # The target has to get left of the wall. A see-saw's right end closes the way; load the left.
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9), goal=star(-0.8, -0.8),
         items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
@@ -704,7 +704,7 @@ class SceneObject:
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
-            # [code] Nothing hits it, for it has no shape. The gear [code] turns it with the plank.
+            # [code] It has no shape, so nothing hits it. A gear turns it with the plank [code].
             weight = pymunk.Body(self.tool.mass, self.tool.mass)
             weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
@@ -948,9 +948,9 @@ class CreateEnv(gym.Env):
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a tool that is refused.
-    In tasks with a marker the goal counts only from the target hit on. This pays +1 (obstacle: +2)
-    and is the first end of an action with the target over 3.56 units from its start, whatever moved
-    it; in obstacle and cannon the marker must also have touched it.
+    In tasks with a marker the goal counts only from the target hit on. This pays +1 (obstacle: +2),
+    once: at the first end of an action with the target over 3.56 units from its start, whatever
+    moved it; in obstacle and cannon the marker must also have touched it.
 
     ## Episode End
     Terminated: goal reached; target off the screen; marker off the screen before the target hit;
@@ -1127,8 +1127,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. A touch before the hit, as by a fan where the marker must touch the target:
-        # [code] counts it once the hit comes; [here] not, because the hit is to bring it there.
+        # Then the goal. The target may be there before the hit (by a fan, in obstacle). [code]
+        # counts this touch when the hit comes; [here] not: the hit is to bring the target there.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 

@@ -136,10 +136,10 @@ class Args:
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
-    published_init: bool = True  # gains of 0.01 and so on of [code]; off: see Agent.__init__
+    published_init: bool = True  # initial weights and biases of [code]; off: see Agent.__init__
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . M s in place of an MLP [here]
-    one_hot: bool = False  # integer states enter one-hot in place of as numbers [here]
+    one_hot: bool = False  # integer states enter as one-hot vectors, not as numbers [here]
     small_pictures: bool = False  # half the size, inverted, three convolutions [here]
 
     # --- evaluation ---
@@ -216,7 +216,7 @@ FAST = {
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
         hidden_size=256,  # which tool, and where: more to represent
-        minibatch_size=128,  # convolutions cost per picture, not per update: so many small ones
+        minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,
         update_epochs=1,  # four passes over the same pictures move the policy too far
         learning_rate=5e-4,  # smaller minibatches are noisier
@@ -229,7 +229,7 @@ FAST = {
         eval_every=102_400,
     ),
     "stacking": dict(
-        published_init=False,  # as in Grid World; and "stop" starts unlikely
+        published_init=False,  # as in Grid World; and ending a tower starts unlikely
         lr_decay_steps=None,  # as in CREATE
         minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
         clip_vloss=False,  # as in CREATE: heights, too, are large against clip_coef
@@ -345,7 +345,7 @@ def cnn(frames, H, small):
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # each tool in a picture makes all features larger: this common size is divided out
+    if small:  # every further tool makes all features larger: LayerNorm takes this factor away
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -460,9 +460,9 @@ class Agent(nn.Module):
         if not self.args.aux_conditioned:  # D.3.2: linear, from the state's encoding; gain 1 [code]
             return layer_init(nn.Linear(H, dims), 1.0)
         # C.4: two layers, from the state's encoding and the projected action (B, 2H). If all three
-        # layers, action_project, `hidden` and `last`, had a gain of 1, each untrained tool would
-        # have a favourite place. So one of them gets 0.01: with published_init action_project
-        # [code], without it `last` [here].
+        # layers, action_project, `hidden` and `last`, had a gain of 1, an untrained policy would
+        # have a favourite place for each tool. So one of them gets 0.01: with published_init it is
+        # action_project [code], without it `last` [here].
         hidden = layer_init(nn.Linear(2 * H, H), 1.0)
         last = layer_init(nn.Linear(H, dims), 1.0 if self.args.published_init else 0.01)
         return nn.Sequential(hidden, nn.ReLU(), last)
@@ -496,21 +496,21 @@ class Agent(nn.Module):
             query = self.utility_query(encoding)  # (B, D)
             return torch.einsum("bd,bkd->bk", query, self.table[available])
 
-        # How good is it to take the action with representation c in a state with encoding s? D.3.2:
+        # How good is it to take the action with representation c in a state with encoding e? D.3.2:
         #
-        #     hidden = ReLU(W [s; project(c)] + b),    logit = out(hidden).
+        #     hidden = ReLU(W [e; project(c)] + b),    logit = out(hidden).
         #
-        # [s; project(c)] is the concatenation. Half of W's columns, W_s, meet s, the other half,
+        # [e; project(c)] is the concatenation. Half of W's columns, W_e, meet e, the other half,
         # W_c, meet project(c) = P c + p. So what is inside of the ReLU is a sum,
         #
-        #     W [s; P c + p] + b  =  (W_s s + b)  +  (W_c P c + W_c p),
+        #     W [e; P c + p] + b  =  (W_e e + b)  +  (W_c P c + W_c p),
         #
         # of a part that is the same for all actions and a part that is the same for all states.
         # Each is computed once; only their sum is formed for every pair. The logits are the same,
         # at a fraction of the cost. (exercises/README.md, 2: write the concatenation.)
-        W_s, W_c = self.utility_hidden.weight.chunk(2, dim=1)  # (H, H) each
+        W_e, W_c = self.utility_hidden.weight.chunk(2, dim=1)  # (H, H) each
         project = self.action_project
-        state_part = F.linear(encoding, W_s, self.utility_hidden.bias)  # (B, H)
+        state_part = F.linear(encoding, W_e, self.utility_hidden.bias)  # (B, H)
         # For the actions, two linear maps follow each other, P and then W_c. They are one map. Most
         # actions are available in many rows of the batch, so the U different ones are mapped once.
         weight = W_c @ project.weight  # (H, H) @ (H, D) -> (H, D)
@@ -992,8 +992,8 @@ def action_phases(args):
     train_K = eval_K
     # Three cases learn with a fixed set instead, and "train" scores them on it: nearest neighbour,
     # the ablation without subsampling, and C.2. All of the set is available all the time. Where the
-    # utility of every action would cost too much, fixed_set_size makes it smaller [code]; the
-    # outputs of nearest neighbour are cheap.
+    # utility of every action would cost too much, fixed_set_size makes it smaller [code].
+    # Nearest neighbour keeps all of it, since its outputs are cheap.
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
@@ -1256,7 +1256,8 @@ def finish(folder, agent, phases, step, seconds):
 
 def plot_curve(folder, metric):
     """C.7, Figure 14: scores over steps, as measured ([code] draws the best score so far)."""
-    # With the same K, the distance between the two lines is the generalisation gap.
+    # The distance between the two lines is the generalisation gap (but where training has a fixed
+    # set of actions, "train" has another K than "valid": see action_phases).
     os.environ.pop("MPLBACKEND", None)  # a notebook's makes the import fail
     from matplotlib.figure import Figure  # not pyplot, which looks for a display
 
@@ -1302,7 +1303,7 @@ class EvaluateArgs:
     actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
     num_available: int | None = None  # K; None: as in the run's own test
     min_angle_gap: float | None = None  # CREATE: only tools this many degrees from training tools
-    min_embedding_distance: float | None = None  # .3: leave out the 30 % nearest to training ones
+    min_embedding_distance: float | None = None  # share: .3 leaves out the 30 % nearest to known
     unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
     episodes: int = 5000  # episodes to play
     save: bool = False  # append the scores to evaluations.csv in the run's folder
@@ -1332,7 +1333,7 @@ def restrict_pool(options, module, table, pool, known):
             raise UserError("min_angle_gap: only the tools of CREATE have angles")
         pool = pool[module.angle_gaps(pool, known) >= gap]
     if ratio is not None:
-        # A mixture as large as the smaller side, whatever the share, so that only the share differs
+        # A mixture as large as the smaller of `pool` and `known`, so that only the share differs
         # between two evaluations. The same mixture for all runs: seed 0.
         rng = np.random.default_rng(0)
         size = min(len(pool), len(known))
