@@ -314,7 +314,7 @@ def engineered_representations() -> np.ndarray:
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
-# paper's main results come from this draw (cannons: 12 of 24 angles). Others may be harder: C(19, 7)
+# paper's main results come from this draw (cannons: 12 of 24). Others may be harder: C(19, 7)
 # / C(24, 12) = 1.9 % of draws have all five from 120 to 180 degrees. Then no test cannon shoots up
 # and well to the left, where most goals are.
 TRAINING_ANGLES = {
