@@ -1,25 +1,26 @@
 """Action representations: a hierarchical VAE over sets of action observations (appendix B, D.3.1).
 
-A policy reads of an action, known or new, a vector that is made from observations of what it does:
-a set X = {x_1 .. x_n} of trajectories, videos or pictures. One latent c explains what the set
-shares (the action), a latent z_j what is special to x_j (a ball's launch, a camera angle). The
-first state s_j of x_j is not predicted but given to the decoder (a picture has none). Model; bound,
-with c ~ q(c | X), z_j ~ q(z_j | x_j, c):
+The policy sees every action, known or new, as a vector. This file computes that vector from what
+the action was seen to do: a set X = {x_1 .. x_n} of trajectories, videos or pictures. One latent c
+explains what the set shares (the action), a latent z_j what is special to x_j (a ball's launch, a
+camera angle). The first state s_j of x_j is not predicted but given to the decoder (a picture has
+none). The model, and its bound from the main paper, with c ~ q(c | X) and z_j ~ q(z_j | x_j, c):
 
         c ~ N(0, I)  ->  z_j ~ p(z | c)  ->  x_j ~ p(x | z_j, c, s_j)
     ELBO per observation = mean_j [ log p(x_j | z_j, c, s_j) - KL(q(z_j | x_j, c) || p(z_j | c)) ]
                            - KL(q(c | X) || N(0, I)) / |X|
 
-Only recipe paper divides the last term by |X|; quick and fast by more (`kl_c_divisor`). The
-representation of an action is the mean of q(c | X). The networks learn from training actions and
-CREATE's no-op; with `--train-on all`, the oracle encoder, from all of the split. After the last
-update every action of the split and the no-op get a row of a table. Actions in no part keep zeros.
+Only recipe paper divides the last term by |X|; quick and fast divide by more (`kl_c_divisor`): a
+weaker KL, as in a beta-VAE, so that more dimensions of c carry information. The representation of
+an action is the mean of q(c | X). A split has three parts: train, valid, test. The networks learn
+from the first and CREATE's no-op; with `--train-on all`, the oracle encoder, from all three. After
+the last update all of these actions get a row of a table. Other actions keep zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
-    python hvae.py gridworld --no-hierarchical   # B: the plain VAE baseline
+    python hvae.py gridworld --no-hierarchical   # appendix B: the plain VAE baseline
     python hvae.py gridworld --train-on all      # the oracle encoder: trained on all parts
-    python hvae.py create --modality video       # B: videos; B's Full Split: --split full
-    python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU (--help lists it)
+    python hvae.py create --modality video       # appendix B: videos; its Full Split: --split full
+    python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU; --help: its numbers
     python hvae.py my_env.py                     # an environment of your own, in a file
 
 Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed SPLITS (names),
@@ -29,11 +30,12 @@ NO_OP (an id), UNITS (see `prepare`); and
     action_labels() -> (NUM_ACTIONS,); engineered_representations() -> (NUM_ACTIONS, D), known facts
     action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
-An observation is (L, F), L states of F numbers each; but of modality "onehot" (L, 2), a cell's x
-and y as whole numbers 0-79, at most 39 from those of the first state and of the one before; of
-"image" (S, S), "video" (L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on seed *and*
-id: several calls are made, each may start `workers` processes. Marks: [code] the authors' program;
-[here] our choice, and why; "appendix:" that of Generalization to New Actions in RL (ICML 2020).
+An observation is (L, F), L states of F numbers each. Of modality "onehot" it is (L, 2), a cell's x
+and y as whole numbers 0-79, at most 39 from those of the first state and of the state before. Of
+"image" it is (S, S), of "video" (L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on
+seed *and* id: several calls are made, each may start `workers` processes.
+Marks: [code] taken from the authors' program; [here] our choice, and why. Where the three differ
+("appendix: ...; [code] ...; [here] ..."), the last is what this file does.
 """
 
 import hashlib
@@ -53,12 +55,13 @@ import tyro
 from torch.distributions import Categorical, Normal, kl_divergence
 from tqdm import tqdm
 
-# Paper map: D.2 (Tables 3-4) -> Args, HYPERPARAMETERS; D.3.1 -> the networks, in its order; D.3.1's
-# loss -> ObservationModel.forward; B -> prepare, HVAE, VAE; D.1 -> fit; Figures 4-6 -> plot_tsne.
-# Table 4's "MLP hidden layers 3" is no option: D.3.1 gives each MLP its own depth.
+# Paper map (sections of the appendix): D.2 (Tables 3-4) -> Args, HYPERPARAMETERS; D.3.1 -> the
+# networks, in its order; its loss -> ObservationModel.forward; B -> prepare, VAE; D.1 -> fit;
+# Figures 4-6 -> plot_tsne. Table 4's "MLP hidden layers 3": D.3.1 gives each MLP its own depth.
 # Shapes: A actions in a batch, N recorded observations of each, n in an update, B = A * n; L states
-# of F numbers per trajectory, the first given, T = L - 1 predicted; C = Z sizes of c, z; H hidden
-# width; E of an encoded observation: H, or H + L * F with --linear-path; S side of a picture.
+# per observation (a picture: 1), the first given, T = L - 1 predicted; F numbers of a state as the
+# networks read it (160 if one-hot, 288 features of a frame); C = Z sizes of c, z; H hidden width;
+# E size of an encoded observation: H, or H + L * F with --linear-path; S side of a picture.
 
 # Name on the command line -> module. (The Recommender, without encoder, is here to load tables.)
 ENVIRONMENTS = dict(
@@ -74,9 +77,9 @@ class Args:
     """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
 
     env: Annotated[str, tyro.conf.Positional]  # gridworld, create, stacking, or a file: my_env.py
-    modality: str  # gridworld: xy, onehot; create: state [code], xy (B), video; stacking: image
+    modality: str  # create: state [code], places of tool and ball, its velocity; xy (B); video
     recipe: Literal[RECIPES]  # which column of HYPERPARAMETERS gives the numbers
-    hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline (B)
+    hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline
     train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, on all parts
     linear_path: bool = False  # the mean of c (VAE: of z) has a linear part (not the paper's)
     split: str = "default"  # name of the split of the actions: default, full, ...
@@ -98,7 +101,7 @@ class Args:
     kl_warmup: float = 0.0  # share of the updates in which the weight of the KLs climbs to 1
     compact_lstm: bool  # a Bi-LSTM of half the width, directions concatenated (none in pictures)
     log_var_start: float | None  # initial log-variance of the decoder (None: from N(0, 1))
-    log_var_rate: float  # factor on the rate of log-variances that are weights (not q(c|X)'s)
+    log_var_rate: float  # factor on the rate of log-variances that no network computes
 
 
 # ---- Tables 3 and 4 ----
@@ -127,15 +130,16 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     # A Bi-LSTM of half the width has 0.26 to 0.35 of the weights, 0.6 of the time of an update.
     "compact_lstm":        (True,  True,  False),
     # RAdam moves a parameter by about the learning rate per update at most: 1e-3 is too slow for a
-    # log-variance that starts near 0 and has to fall to the clamp at -4 (ObservationModel.forward).
+    # log-variance that has to fall from 0 to the clamp at -4 (ObservationModel.forward). So the
+    # decoder's starts lower, and it learns 10 times as fast; so do those of z (not tried singly).
     "log_var_start":       (-2.0,  -2.0,  None),
     "log_var_rate":        (10.0,  10.0,  1.0),
 }
-# In place of rows above or defaults of Args. One entry counts: modality's, else environment's.
+# In place of rows above: the entry of the modality or, if there is none, of the environment.
 EXCEPTIONS = {
     "onehot": {"updates": (2_000, 4_000, 0)},  # it takes longer to learn what 160 numbers mean
-    # Without these changes the model ignored z (how the ball was launched): the squared error, in
-    # units of `step` (see prepare), stayed near 6.5; with all it is below 1. Not tried singly.
+    # Without these changes the model ignored z (how the ball was launched): the squared error of a
+    # trajectory, in units of `step` (see prepare), stayed near 6.5; with all it is below 1.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
@@ -237,8 +241,9 @@ def prepare(raw, args):
     later = raw[:, 1:]  # (B, T, F)
     moves = raw.diff(dim=1)  # (B, T, F)
     if args.modality == "onehot":
-        # Relative class 40 is "no change", 41 one cell right or down; a first state keeps its cell.
-        # The input has 80 zeros and ones for x and for y, the target one class number for each.
+        # The input has 80 zeros and ones for x and for y, the target one class number for each. In
+        # the first state class 40 is cell 40. Later it is "no change" (41: one cell right or down),
+        # in the input since the state before, in the target since the first.
         if args.relative:
             raw = torch.cat([first, moves + CLASSES // 2], 1)
             later = later - first + CLASSES // 2
@@ -286,8 +291,8 @@ class SumReLU(nn.Module):
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
-    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. One per dimension would
-    # give an unused dimension of c a mean of variance 1, which costs KL; shared, it stays small.
+    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. A norm per dimension would
+    # scale even an unused dimension of c to variance 1, which costs KL; here it stays small.
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
@@ -307,7 +312,7 @@ def initialise(module):
         nn.init.zeros_(module.bias)
 
 
-# Keys: height = width of a picture. Of videos it is 84 in B; 48 in A.3, D.3.1, [code] and [here].
+# Keys: side of a picture. Videos: 84 in appendix B; 48 in A.3, D.3.1, [code] and [here].
 ENCODER_LAYERS = {48: 7, 84: 9}
 ENCODER_CHANNELS = (8, 8, 16, 16, 16, 16, 32, 32, 32)  # [code] after each layer
 DECODER_SIDES = {48: (6, 12, 24, 48), 84: (6, 11, 21, 42, 84)}  # [code] after each stage
@@ -357,7 +362,7 @@ class ActionInference(nn.Module):
 
     def forward(self, h):
         # A mean ignores the order and takes any number: few in training, at the end all recorded.
-        pooled = self.before(h).mean(1)  # (A, n, H) -> (A, H)
+        pooled = self.before(h).mean(1)  # (A, n, hidden) -> (A, hidden)
         return normal(*self.norm(self.after(pooled)).chunk(2, -1))  # (A, 2C) -> twice (A, C)
 
 
@@ -383,7 +388,7 @@ class ObservationInference(nn.Module):
 class ObservationDecoder(nn.Module):
     """Observation Decoder: first state (B, F), latents -> (B, T, F), the means of later states."""
 
-    # F: 160 logits of a one-hot state, 288 features of a frame; a picture has no steps: (B, 1, F).
+    # One-hot: their logits. Frames: their features. A picture has no steps: latents -> (B, 1, F).
     def __init__(self, latents, features, hidden, steps):
         super().__init__()
         self.steps = steps
@@ -399,8 +404,8 @@ class ObservationDecoder(nn.Module):
             return self.output(effect)[:, None]
         # By this product the start can cancel the effect: beside a wall, a move does nothing.
         gated = effect * self.start(start)  # (B, H)
-        # appendix: this vector is the LSTM's input, at every step; [code] the start is replaced by
-        # the state predicted last; [here] as the appendix, which also learns sooner.
+        # appendix: this vector is the LSTM's input, it does not say how; [code] a new product at
+        # every step, with the state predicted last; [here] the same at each: it learns sooner.
         sequence = gated[:, None].expand(-1, self.steps, -1)  # (B, T, H)
         return self.output(self.lstm(sequence)[0])  # (B, T, F)
 
@@ -431,7 +436,7 @@ def conv_decoder(side, mask):
 
 
 class ObservationModel(nn.Module):
-    """Encoder, decoder and likelihood of observations. Subclasses: `q`, `infer`, `represent`."""
+    """Encoder, decoder, likelihood; HVAE and VAE add `posterior`, `represent` and `infer`."""
 
     def __init__(self, args, shape, latents):
         # shape: of one raw observation, (L, F), (L, S, S) or (S, S). latents: their sizes.
@@ -439,24 +444,24 @@ class ObservationModel(nn.Module):
         self.args = args
         features = shape[-1]  # F, of trajectories; other modalities correct these numbers below
         steps = shape[0] - 1  # T
-        sigmas = features  # shape of the decoder's log-variances: per number or pixel, for all T
+        log_vars = features  # shape of the decoder's: one a number or pixel, shared by all steps
         if args.modality == "onehot":
             features = CLASSES * shape[-1]
         if args.modality in VISUAL:
             features = 32 * 3 * 3  # [code] channels * height * width after the last convolution
-            sigmas = (1, *shape[-2:])
+            log_vars = (1, *shape[-2:])
             self.conv = conv_encoder(shape[-1])
             self.conv_decoder = conv_decoder(shape[-1], args.modality == "video")
             self.to(memory_format=torch.channels_last)  # [here] 1.4 times as fast on a CPU
         if args.modality == "image":
-            # appendix: Bi-LSTM for trajectories only; [code] pictures, too; [here] a linear layer.
+            # appendix: Bi-LSTM for trajectories; [code] pictures, too; [here] none: no sequence.
             steps = 0
             self.sequence = nn.Sequential(nn.Flatten(), nn.Linear(features, args.hidden), nn.ReLU())
         else:
             self.sequence = TrajectoryEncoder(features, args.hidden, args.compact_lstm)
         self.decoder = ObservationDecoder(latents, features, args.hidden, steps)
         if args.modality != "onehot":
-            self.log_var = nn.Parameter(torch.randn(sigmas))
+            self.log_var = nn.Parameter(torch.randn(log_vars))
             if args.log_var_start is not None:
                 nn.init.constant_(self.log_var, args.log_var_start)
         # What the inference networks read: the encoded observation and, with --linear-path, the
@@ -468,7 +473,7 @@ class ObservationModel(nn.Module):
             self.path = nn.Linear(self.encoded_size, args.representation_size)
 
     def encode(self, x):
-        # What `prepare` returns first -> start (B, F), for the decoder; encoded x (B, E).
+        # What `prepare` returns first -> start (B, F) (of a picture not used); encoded x (B, E).
         if self.args.modality in VISUAL:
             features = self.conv(x.flatten(0, 1))  # (B * L, 1, S, S) -> (B * L, 288)
             x = features.unflatten(0, x.shape[:2])  # (B, L, 288)
@@ -504,8 +509,6 @@ class ObservationModel(nn.Module):
 
     def forward(self, raw):
         # Raw observations (A, n, ...) -> the three terms of the objective, each per observation.
-        # In order: encode every observation; draw one c for a set and repeat it for its n
-        # observations; draw a z for each (`infer`; the VAE has no c); decode; compute the terms.
         x, target = prepare(raw.flatten(0, 1), self.args)  # (B, ...), B = A * n
         start, h = self.encode(x)
         latents, kl_z, kl_c = self.infer(h.unflatten(0, raw.shape[:2]))
@@ -514,8 +517,8 @@ class ObservationModel(nn.Module):
             likelihood = Categorical(logits=output, validate_args=False)
         else:
             likelihood = normal(output, self.log_var.clamp(-4.0, 3.0))  # [code] the clamp
-        # Sums over all that belongs to one observation, then means over observations. [code] also
-        # has rec * w and KL / w, w = 1 + 0.5^epoch; [here] left out: w is 1 after a few epochs.
+        # Sums over all that belongs to one observation (or c), then means over the batch. [code]
+        # also has rec * w, KL / w, w = 1 + 0.5^epoch; [here] left out: w is 1 after a few epochs.
         rec = likelihood.log_prob(target).flatten(1).sum(1).mean()
         kl_z = kl_z.sum(-1).mean()
         kl_c = kl_c.sum(-1).mean() / self.args.kl_c_divisor
@@ -533,44 +536,44 @@ class HVAE(ObservationModel):
         self.p_z = ObservationInference((size,), args.hidden, size)
         self.apply(initialise)
 
-    def q(self, h):  # q(c | X): encoded observations (A, N, E) -> Gaussian of c, (A, C)
+    def posterior(self, h):  # q(c | X): encoded observations (A, N, E) -> Gaussian of c, (A, C)
         return self.add_linear_path(self.q_c(h), h.mean(1))
 
     def represent(self, h):  # (A, N, E) -> representations (A, C)
-        return self.q(h).mean
+        return self.posterior(h).mean
 
     def infer(self, h):
         # Encoded observations (A, n, E) -> latents (z, c), KL of z (B, Z), KL of c (A, C).
-        q_c = self.q(h)
-        c = q_c.rsample().repeat_interleave(h.shape[1], 0)  # one for a set: (A, C) -> (B, C)
-        q_z = self.q_z(h.flatten(0, 1), c)
-        kl_z = kl_divergence(q_z, self.p_z(c))
-        kl_c = kl_divergence(q_c, Normal(0.0, 1.0))
-        return (q_z.rsample(), c), kl_z, kl_c
+        action = self.posterior(h)
+        c = action.rsample().repeat_interleave(h.shape[1], 0)  # one for a set: (A, C) -> (B, C)
+        observation = self.q_z(h.flatten(0, 1), c)
+        kl_z = kl_divergence(observation, self.p_z(c))
+        kl_c = kl_divergence(action, Normal(0.0, 1.0))
+        return (observation.rsample(), c), kl_z, kl_c
 
 
 class VAE(ObservationModel):
-    """The non-hierarchical baseline (B): encodes observations one by one, averages at the end."""
+    """The non-hierarchical baseline: encodes observations one by one, averages at the end."""
 
     # [code] A quarter of the HVAE's updates, another initialisation, representations from 62 or 128
-    # observations; [here] as the HVAE. KL(q(z | x) || N(0, I)) has weight 1: no c to weaken.
+    # observations; [here] as the HVAE. No c, so kl_c_divisor has no effect: z's KL is not divided.
     def __init__(self, args, shape):
         size = args.representation_size
         super().__init__(args, shape, latents=(size,))
         self.q_z = ObservationInference((self.encoded_size,), args.hidden, size)
         self.apply(initialise)
 
-    def q(self, h):  # q(z | x): encoded observations (A, N, E) -> Gaussians of z, (A, N, Z)
+    def posterior(self, h):  # q(z | x): encoded observations (A, N, E) -> Gaussians, (A, N, Z)
         return self.add_linear_path(self.q_z(h), h)
 
     def represent(self, h):  # (A, N, E) -> (A, N, Z) -> representations (A, Z)
-        return self.q(h).mean.mean(1)
+        return self.posterior(h).mean.mean(1)
 
     def infer(self, h):
         # Encoded observations (A, n, E) -> latents (z,), KL of z (A, n, Z), and no KL of c.
-        q_z = self.q(h)
-        kl_z = kl_divergence(q_z, Normal(0.0, 1.0))
-        return (q_z.rsample().flatten(0, 1),), kl_z, torch.zeros(1)
+        observation = self.posterior(h)
+        kl_z = kl_divergence(observation, Normal(0.0, 1.0))
+        return (observation.rsample().flatten(0, 1),), kl_z, torch.zeros(1)
 
 
 # ---- training ----
@@ -587,7 +590,7 @@ def write_pieces(path, pieces):
     # They go to a temporary file, which is renamed in the end: nobody ever reads half a file.
     temporary = path.with_name(f".{os.urandom(8).hex()}-{path.name}")
     try:
-        for piece in pieces:  # an error in making a piece keeps its traceback
+        for piece in pieces:  # may be a generator: its own errors keep their traceback
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with open(temporary, "ab") as file:
@@ -640,8 +643,7 @@ def observe(module, ids, args):
 
 
 def fit(model, data, rows, args):
-    # Maximise the objective on data[rows]; return the losses of every update, a list of dicts.
-    # Parameters called log_var have a learning rate of their own.
+    # Maximise the objective on data[rows]; return its terms in every update, a list of dicts.
     groups = []
     for name, parameter in model.named_parameters():
         factor = args.log_var_rate if name.endswith("log_var") else 1.0
@@ -746,9 +748,8 @@ def check_table(path, mean, module):
 
 
 def action_set(module):
-    # Do row numbers still mean the same actions? A hash of labels and engineered representations;
-    # these are rounded to 3 decimals, because last bits vary by machine.
-    features = np.round(module.engineered_representations(), 3) + 0.0  # -0.0 becomes 0.0
+    # Do row numbers still mean the same actions? A hash of labels and engineered representations.
+    features = np.round(module.engineered_representations(), 3) + 0.0  # last bits vary; -0 is 0
     return short_hash([*map(str, module.action_labels()), features.tolist()])
 
 
@@ -791,7 +792,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
 
 
 def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
-    """Scores of held-out rows: what known facts they tell, by fits on the training rows."""
+    """How well a table tells known facts of held-out actions (regressions learn on training's)."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
     from sklearn.pipeline import make_pipeline
@@ -805,8 +806,8 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
     ridge = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-4, 4, 17)))
     # Of Grid World's skills: a linear read-out of the net displacement; logistic ones of the five
     # moves, by chance 0.25; the share whose nearest training skill has the same displacement.
-    # The authors' tables, released with [code], in this order: 0.946, 0.604, 0.717 (HVAE);
-    # 0.970, 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
+    # The same of the representations released with [code]: 0.946, 0.604, 0.717 (HVAE); 0.970,
+    # 0.705, 0.721 (oracle encoder); 0.908, 0.496, 0.496 (VAE).
     scores = {}
     if environment_name(env) == "gridworld":
         net = features[:, :2]  # net displacement, -5..5, as in [code]; B has the five moves only
@@ -859,8 +860,7 @@ def plot_tsne(mean, labels, path):
 
 def parse_args(words: list[str]) -> Args:
     """Args of a command line; --help shows the numbers of *its* environment and recipe."""
-    # First pass: only to learn env, recipe and modality (Grid World's numbers are fillers; modality
-    # "" = not given). Second pass: the whole line, with the right defaults.
+    # Twice: first only for env, recipe and modality ("": not given), then with their defaults.
     first = replace(default_args("gridworld"), modality="")
     first = tyro.cli(Args, args=[w for w in words if w not in ("-h", "--help")], default=first)
     default = default_args(first.env, first.recipe, first.modality)

@@ -74,7 +74,7 @@ BIG, VISUAL = dict(representation_size=128), dict(representation_size=128, hidde
 
 @pytest.mark.parametrize("modality, shape, changes, hierarchical, flat", [
     ("xy", (6, 2), {}, 339_818, 207_334),
-    ("onehot", (6, 2), {}, 441_254 - 160, 308_770 - 160),  # no unused sigmas
+    ("onehot", (6, 2), {}, 441_254 - 160, 308_770 - 160),  # no unused log-variances
     ("state", (7, 6), BIG, 414_738, 224_462),
     ("xy", (7, 2), BIG, 412_170, 221_894),
     ("video", (7, 48, 48), VISUAL, 1_549_968, 1_269_132),
