@@ -17,11 +17,13 @@ nearest to the one it drew; `continuous` draws a point in the space of represent
 the available action nearest to it; `--representation vae` takes a plain VAE.
 Ablations: `--ent-coef 0`, `--no-subsample`. Appendix C: C.1 `--task`; C.2 `--finetune`, `--adapt`;
 C.3 `--no-subgoal-reward`; C.4 `--[no-]aux-conditioned`; C.5 `--fully-observable`; C.6
-`--placement`, `--split full`; C.7 curve.png of every run. A.3's analyses: `create --split analysis
---representation hvae-all`, then `evaluate RUN --min-angle-gap 5` and its other options.
+`--placement`, `--split full`; C.7 curve.png of every run. A.3's analyses (how does the score fall
+as unseen actions get less like the known ones?): `create --split analysis --representation
+hvae-all`, then `evaluate RUN --min-angle-gap 5` and its other options.
 
     python ppo_actiongen.py gridworld --quick         # minutes; or: recsys, create, stacking
-    python ppo_actiongen.py gridworld --recipe paper  # policy of Tables 3, 4 (also: --hvae-recipe)
+    python ppo_actiongen.py gridworld --recipe paper  # Tables 3, 4: the policy; for the encoder,
+                                                      # too, add --hvae-recipe paper
     python ppo_actiongen.py gridworld --method nearest-neighbor
     python ppo_actiongen.py gridworld --finetune runs/gridworld-s0     # C.2
     python ppo_actiongen.py my_env.py                 # an environment of your own: see README.md
@@ -35,10 +37,11 @@ then what surrounds them: which actions are available, checks, the run's folder,
 
 Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
 A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
-f_omega(s). A step is one action of one environment. A *score* is the entry of an episode's last
-info whose key is METRIC in the environment's file (success, click-through rate, height). Two marks:
-[code] is the authors' released program, followed where the appendix is silent (a comment says so
-where the two disagree); [here] is a choice of this repository, with its reason.
+f_omega(s). A step is one action of one environment. A *score* is one number per episode (success,
+click-through rate, height): its last info has it, under the name METRIC of the environment's file.
+Two marks: [code] is the authors' released program, followed where the appendix is silent (where the
+two disagree, a comment says which one is followed); [here] is a choice of this repository, with its
+reason.
 """
 
 import atexit
@@ -113,9 +116,9 @@ class Args:
 
     # --- which actions are available ---
     num_available: int = 50  # K while training (Table 3 "actions per episode")
-    eval_available: int | None = None  # K in evaluations; None: as while training
-    subsample: bool = True  # a random subset per episode; off: always the same training actions
-    fixed_set_size: int | None = None  # --no-subsample or --adapt: only this many actions
+    eval_available: int | None = None  # K in evaluations; None: num_available
+    subsample: bool = True  # a random subset per episode; off: all training actions, always
+    fixed_set_size: int | None = None  # --no-subsample or --adapt: not all, but this many
 
     # --- PPO (Table 4 unless it says otherwise) ---
     # Table 3's "PPO batch size" is the size of a minibatch [code]. So CleanRL's num_steps is
@@ -132,7 +135,7 @@ class Args:
     vf_coef: float = 0.5  # weight of the value loss
     clip_vloss: bool = True  # clip the value's changes as well [code]
     ent_coef: float = 0.05  # weight of the entropy bonus (Table 3); 0: w/o entropy
-    ent_floor: float = 1.0  # fraction of ent_coef left when the learning rate has fallen [here]
+    ent_floor: float = 1.0  # ent_coef falls with the learning rate, to this fraction [here]
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
@@ -168,8 +171,8 @@ TABLE_3 = {
     "representation": ("hvae", "engineered", "hvae", "hvae"),  # A.2: recsys provides them
     "task": (None, None, "push", None),
     "placement": (None, None, None, "1d"),
-    # D.2: the rate falls linearly over the training. In CREATE and Stacking it takes longer [code],
-    # so their runs end at .46 and .97 of the rate; followed here, as published scores come from it.
+    # D.2: the rate falls linearly over the training. In CREATE and Stacking over 100M steps [code],
+    # more than they train, so they end at .46 and .97 of it. Followed here: it made the scores.
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
@@ -270,7 +273,6 @@ def default_args(env="gridworld", recipe="fast", quick=False):
 # Started by `torchrun --nproc_per_node=2 ppo_actiongen.py ...`, each process (its number is RANK)
 # plays its share of the environments and learns from its share of every minibatch. Gradients are
 # averaged, so all processes keep the same weights. Rank 0 alone evaluates, writes and prints.
-# Started by `python`, there is one process, and the two functions below have nothing to collect.
 RANK = int(os.environ.get("RANK", 0))
 WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 
@@ -301,7 +303,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of a stream: (run's seed, use), where needed followed by the step and the rank."""
+    """`n` seeds of a stream: the run's seed, the use and, while training, step and rank."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -334,13 +336,12 @@ def cnn(frames, H, small):
         # [here] 42 -> 21 -> 11 -> 6. At 6 x 6 the features still show where the balls are.
         channels = [frames, 16, 32, 64]
         features = 64 * 6 * 6
-    # Each convolution sees twice as far as the one before it, in half the resolution.
     layers = []
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
-        # [code] keeps PyTorch's initial weights, so small that all pictures have nearly the same
-        # features at first. A run of a few million steps would lose time over it: with
-        # --small-pictures they are larger [here]. (Stacking, at full size, keeps [code]'s.)
+        # [code] keeps PyTorch's initial weights. They shrink the signal from layer to layer, until
+        # all pictures have nearly the same features. A run of a few million steps would lose time
+        # over it: with --small-pictures, and only there, they are larger [here].
         if small:
             layer_init(conv)
         layers += [conv, nn.ReLU()]
@@ -351,7 +352,7 @@ def cnn(frames, H, small):
 
 
 def small_inverted(frames):
-    """Pictures (N, C, 84, 84) uint8, black on white -> (N, C, 42, 42) uint8, 255 on 0."""
+    """Pictures (N, C, 84, 84) uint8, dark on white -> (N, C, 42, 42) uint8, bright on 0."""
     # The white background becomes 0. At the start of an episode, the stack of frames is padded with
     # black ones; inverted they would be all 255, so they are set to 0.
     is_real = frames.amax((2, 3), keepdim=True) > 0  # (N, C, 1, 1)
@@ -411,7 +412,7 @@ class Agent(nn.Module):
         else:
             self.obs_stats = RunningMeanStd(state.shape)
             width = math.prod(state.shape)
-            if args.one_hot:  # every first grid of Grid World holds all kinds of cells
+            if args.one_hot:  # whatever the reset, Grid World's grid holds all kinds of cells
                 first_states = envs.reset()[0]["state"]
                 self.register_buffer("cell_ids", torch.as_tensor(first_states).unique())
                 width *= len(self.cell_ids)
@@ -523,7 +524,7 @@ class Agent(nn.Module):
         piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
         for states, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
-            actions = action_part.index_select(0, rows.flatten())  # faster than [rows]; (b * K, H)
+            actions = action_part.index_select(0, rows.flatten())  # action_part[rows]: (b * K, H)
             hidden = states[:, None] + actions.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
             logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
         return torch.cat(logits) + self.utility_out.bias
@@ -542,9 +543,9 @@ class Agent(nn.Module):
         if self.args.method == "utility":
             return drawn
         # A baseline takes the available action nearest to the training action, or to the point,
-        # that was drawn. The loss needs only the probability of what was drawn; what follows is
-        # like a part of the environment. (While nearest-neighbor is trained, all training actions
-        # are available, so it gets what it drew.)
+        # that was drawn. The loss needs only the probability of what was drawn: this look-up is
+        # outside the policy, as if the environment did it. (While nearest-neighbor is trained, all
+        # training actions are available, so it gets what it drew.)
         if self.args.method == "nearest-neighbor":
             drawn = self.table[self.train_ids[drawn]]  # (B,) -> (B, D)
         difference = self.table[available] - drawn[:, None]  # (B, K, D) - (B, 1, D)
@@ -726,8 +727,8 @@ def ppo_loss(agent, mb, ent_coef):
     # limits how far the value may move from the rollout's: by clip_coef, in units of value.
     error = (value - mb["return"]).square()
     if args.clip_vloss:
-        step = (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
-        error = torch.max(error, (mb["value"] + step - mb["return"]).square())
+        change = (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
+        error = torch.max(error, (mb["value"] + change - mb["return"]).square())
     v_loss = 0.5 * error.mean()
 
     # The regulariser *entropy bonus*: it keeps more than one available action likely.
@@ -769,14 +770,14 @@ def update(agent, optimizer, batch, ent_coef):
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
     # A phase is a pair: the pool of actions, and the number K of them that is available. The policy
-    # is trained in "learn" and scored in "train" and "valid". "learn" and "train" have one pool,
-    # but may differ in K: Grid World's fast recipe learns with 20 available actions, tests have 50.
+    # learns in the phase "learn". "train" scores it on the same actions (the "seen" ones, maybe
+    # with another K: see action_phases), "valid" selects, "test" is played at the end.
     check(args)
     phases, train_ids = action_phases(args)
     # 1. of Algorithm 1. Rank 0 makes the run's folder and, if there is no table of representations
     # yet, trains the encoder. All others wait here, and receive both.
     made = (claim_folder(args), load_table(args)) if RANK == 0 else None
-    folder, table = gather_from_all(made)[0]
+    folder, table = gather_from_all(made)[0]  # [0]: what rank 0 has made
 
     # Environments, networks, optimiser.
     device = choose_device(args)
@@ -813,8 +814,8 @@ def train(args):
         if starts_afresh:
             # At first and after every checkpoint, all random numbers and all episodes start
             # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
-            # Episodes still running are dropped. Nothing is lost: the last iteration has learned
-            # from them, with `next_value` (below) in place of what was to come.
+            # Episodes still running are dropped, their ends are never seen. The last iteration has
+            # learned from their beginnings, with `next_value` (below) in place of what was to come.
             torch.manual_seed(seeds(1, args.seed, TORCH, step, RANK)[0])
             obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
             G = torch.zeros(N, device=device)  # see running_returns
@@ -847,7 +848,8 @@ def train(args):
 
         # Learn. The statistics of the states follow afterwards: with new ones every probability
         # would change, and the ratio in ppo_loss would not start at 1. While fine-tuning they stay
-        # as they were [code]: the layers that were taken over expect just these units.
+        # as they were [code]: the layers that were taken over expect just these units. (Those of
+        # the rewards, above, start anew; whether they do in [code] is not known.)
         numbers = update(agent, optimizer, batch, ent_coef)
         if not (agent.is_image or args.one_hot or args.finetune):
             agent.obs_stats.update(batch["state"].flatten(0, 1))
@@ -859,12 +861,14 @@ def train(args):
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
         # with actions which neither encoder nor policy was trained on. Test actions do not select:
-        # the best of many noisy scores is optimistic, so the reported one must be of other actions.
+        # the best of many noisy scores is too high by luck, so the score that is reported has to
+        # come from actions that had no part in the choice.
         # (Only the oracle encoder, hvae-all, was trained on all actions.)
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
-            stream = (args.seed, VALIDATION, step)  # one for both: only their actions differ
+            # The same random numbers for both scores, so that only their actions differ.
+            stream = (args.seed, VALIDATION, step)
             train_score = evaluate(agent, phases["train"], args.valid_episodes, stream)["score"]
             valid_score = train_score  # C.2 has no actions but those that it adapts to
             if not args.adapt:
@@ -872,7 +876,8 @@ def train(args):
             if valid_score > best_score:
                 best_score = valid_score
                 best = dict(args=vars(args), step=step, agent=agent.state_dict())
-                # hvae.write: the whole file or nothing, even if the process is killed meanwhile.
+                # hvae.write calls torch.save(best, file), with a new file that gets its name when
+                # it is whole. So a process that is killed leaves no half file.
                 hvae.write(folder / "best.pt", partial(torch.save, best))
 
         # Record what happened (under torchrun: to the environments of rank 0).
@@ -896,8 +901,8 @@ def train(args):
     if RANK:
         return {}
 
-    # Test, once (Algorithm 2): the selected policy, frozen, with actions it has never met (in C.2:
-    # with those that it was adapted to).
+    # Test, once (Algorithm 2): the selected policy, frozen, on all parts of the split. The result
+    # is its score with test actions, which it has never met (C.2: with those it was adapted to).
     log.close()
     return finish(folder, agent, phases, step, seconds)
 
@@ -909,7 +914,7 @@ def evaluate(agent, phase, episodes, stream):
     """The frozen policy with actions of a phase, (action_pool, K): means over `episodes` episodes.
 
     Nothing is learned here; for new actions other rows of the table are read. Every episode has its
-    own K of them (or all). Actions are drawn, as in training, not the likeliest taken [code].
+    own K actions of the pool. Actions are drawn, as in training, not the likeliest taken [code].
     `stream` names the random numbers, see `seeds`. Returns score, its standard error over episodes
     (published error bars are over 5 seeds, 8 in Grid World, instead), return, length, episodes.
     """
@@ -984,8 +989,8 @@ def action_phases(args):
 
     # "learn": the policy is trained; "train": it is scored on the same actions; "valid": selects
     # the checkpoint; "test": scored once, at the end. K random actions of the pool are available in
-    # an episode: num_available in "learn", eval_available elsewhere. In C.2 (adapt) there are only
-    # "learn" and "train", and both have the actions that are the test actions of all other runs.
+    # an episode: num_available in "learn" (fast Grid World: 20), eval_available elsewhere (50). In
+    # C.2 (adapt) there are only "learn" and "train", with the test actions of all other runs.
     action_pool = split["test"] if args.adapt else split["train"]
     learn_K = args.num_available
     eval_K = args.eval_available or learn_K
@@ -1119,7 +1124,7 @@ def run_name_of(args):
     name = args.run_name
     if name is None:
         usual = vars(default_args(args.env, args.recipe, args.quick))
-        usual.update(recipe="fast", quick=False)  # so that these two, too, appear in the name
+        usual.update(recipe="fast", quick=False)  # if not so, these two appear in the name, too
         words = [hvae.environment_name(args.env)]
         for option, value in vars(args).items():
             if value != usual[option] and option not in ("seed", *FREE):
@@ -1138,8 +1143,8 @@ def claim_folder(args):
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
     # Two processes in one folder would mix their rows. The operating system ends a lock with its
-    # process, however that ends. filelock also ends it as soon as no variable holds it any more, so
-    # it is handed to atexit. (is_singleton: within one process, claiming it twice is no conflict.)
+    # process, however that ends. atexit keeps the lock: it would be released, too, when no variable
+    # holds it any more. (is_singleton: within one process, claiming it twice is no conflict.)
     lock = FileLock(folder / ".lock", is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -1196,8 +1201,8 @@ def write_json(path, content):
 class Log:
     """A run's metrics.csv, TensorBoard events and progress bar."""
 
-    # metrics.csv has one row per rollout; scores stand only in the rows of evaluations. TensorBoard
-    # shows the same numbers: tensorboard --logdir runs.
+    # metrics.csv has one row per rollout; train_score and valid_score stand only in the rows of
+    # evaluations. TensorBoard shows the same numbers: tensorboard --logdir runs.
     def __init__(self, args, folder, step, size):
         from torch.utils.tensorboard import SummaryWriter  # here, because it takes 1.5 s
 
@@ -1229,8 +1234,7 @@ class Log:
 
 def finish(folder, agent, phases, step, seconds):
     """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
-    # The last policy is forgotten; what is tested is the one that validation has selected. Except
-    # in C.2, the policy meets test actions here for the first time; their scores decide nothing.
+    # The last policy is forgotten; what is tested is the one that validation has selected.
     args = agent.args
     best = load(folder / "best.pt")
     put(best, folder, agent=agent)
@@ -1258,7 +1262,7 @@ def plot_curve(folder, metric):
     """C.7, Figure 14: scores over steps, as measured ([code] draws the best score so far)."""
     # The distance between the two lines is the generalisation gap (but where training has a fixed
     # set of actions, "train" has another K than "valid": see action_phases).
-    os.environ.pop("MPLBACKEND", None)  # a notebook's makes the import fail
+    os.environ.pop("MPLBACKEND", None)  # a notebook sets it to one that may not be installed here
     from matplotlib.figure import Figure  # not pyplot, which looks for a display
 
     rows = np.genfromtxt(folder / "metrics.csv", delimiter=",", names=True, encoding="utf-8")
@@ -1374,7 +1378,7 @@ def evaluate_run(options):
     print(module.METRIC + " {score:.4f} +- {stderr:.4f}".format(**result))
     if options.save:
         # `best_step` tells which checkpoint was scored: an unfinished run may still find a better.
-        row = dict(vars(options), num_available=K, pool_size=len(pool), **result)
+        row = dict(vars(options), actions=part, num_available=K, pool_size=len(pool), **result)
         row["best_step"] = best["step"]
         append_row(folder / "evaluations.csv", row)
     if options.gif:
@@ -1388,11 +1392,12 @@ def evaluate_run(options):
 
 def parse_args(words):
     """Args of a command line."""
-    # Environment, recipe and quick decide all other defaults, so the line is read twice.
+    # Environment, recipe and quick decide all other defaults, so the line is read twice. An
+    # environment of one's own gets its absolute path.
     first = tyro.cli(Args, args=[word for word in words if word not in ("-h", "--help")])
     default = default_args(first.env, first.recipe, first.quick)
     args = tyro.cli(Args, args=words, default=default, description=__doc__)
-    return replace(args, env=default.env)  # an own file by its absolute path
+    return replace(args, env=default.env)
 
 
 def main(words):
