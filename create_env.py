@@ -85,7 +85,7 @@ LAMBDA_OVERLAP = -0.01  # Eq. 3
 MIN_TOOL_GAP = 0.3  # [code] norm: tool centres this close "overlap"
 # A.3 "no moving objects" [code]: an action is still if at its end no body's centre is faster than
 # this. One still action is forgiven, because the agent may set things going again. The second ends
-# the episode, even if others lie between: [code] never resets the count, and so it is here.
+# the episode, even if things moved in between: [code] never resets the count, and so it is here.
 STILL_SPEED = 0.05  # units/s
 STILL_ACTIONS = 2
 HIT_DISTANCE = 0.03  # [code] share of the screen's diagonal, 3.56 units: the target hit
@@ -95,7 +95,7 @@ BALL_RADIUS = 4.0  # [code] units: marker, goal and probe ball, and the target i
 BALL_MASS = 10.0  # [code]
 PLANK_MASS = 10.0  # [code] of levers and see-saws
 PLANK_MOMENT = 10_000.0  # [code] a rod of 20 units would have 333, so planks turn slowly
-LADDER_LEAN = 4.0  # [code] factor on the sideways speed of a ball on a ladder
+LADDER_LEAN = 4.0  # [code] factor on the sideways speed of a ball on a ladder: it drifts off
 VESSEL_ELASTICITY = 0.5  # [code] of all funnels and buckets; not in engineered_representations
 
 METRIC = "success"  # the goal was reached in the episode (0 or 1)
@@ -160,7 +160,7 @@ RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# A corner points to the angle. No 45, squares that lie flat: [code]'s class of boxes, in no split.
+# A corner points to the angle. At 45 squares lie flat: a class of [code], boxes, that no split has.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. Planks and ball tools have no friction: [code] forgets to set it.
@@ -186,7 +186,7 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    # Never placed in a game. A recording begins around the probe ball's touch, so it needs a shape.
+    # Never placed in a game. Recordings need something to touch: a disc without effect, a GOAL.
     "No-op": Kind("disc", GREEN, GOAL),
     # The tools in the order of their ids, which saved representations and runs rely on. Down to the
     # bucket they are those of the Default Split.
@@ -314,9 +314,9 @@ def engineered_representations() -> np.ndarray:
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
-# paper's main results come from this draw (cannons: 12 of 24). Others may be harder: C(19, 7)
-# / C(24, 12) = 1.9 % of draws have all five from 120 to 180 degrees. Then no test cannon shoots up
-# and well to the left, where most goals are.
+# paper's main results come from this draw (cannons: 12 of 24 angles). Others may be harder: in
+# C(19, 7) / C(24, 12) = 1.9 % of all draws, the five from 120 to 180 degrees are all for training.
+# Then no test cannon shoots up and well to the left, where most goals are.
 TRAINING_ANGLES = {
     ("Ramp", "Trampoline"): (45, 60, 75, 90, 105, 165),
     ("Triangle", "Bouncy Triangle"): (30, 45, 60, 105),
@@ -505,8 +505,8 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # The marker rolls down to the right, where boxes fall. It has to reach the subgoal there and to
-    # come back below to the target, which then rolls down to the star.
+    # The marker rolls down to the right, past falling boxes. It has to reach the subgoal there and
+    # to come back below to the target, which then rolls down to the star.
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
@@ -599,7 +599,7 @@ def to_units(norm):
 # contact box never turns. [here] it turns with the aim, as its picture does. This changes only
 # where it catches a ball, not where or how fast it shoots.
 BOX_SIZE = {"Cannon": (10.0, 7.3), "Fan": (6.7, 10.0)}
-MUZZLE = (5.0, 3.65)  # [code] units: times (cos, sin) of the aim, where balls are shot from
+MUZZLE = (5.0, 3.65)  # [code] units: balls start at (5 cos, 3.65 sin) of the aim, from the centre
 # [code] Funnels and buckets are open between their last corner and their first. At tool angle 0 a
 # funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees, a bucket's at 135, 225, 315 and 45.
 LAST_CORNER = {"Funnel": 30, "Bucket": 45}
@@ -698,14 +698,14 @@ class SceneObject:
         # joints made for this. On average over 800 launches per class balls move as in [code].
         fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
         if self.tool.max_angle:
-            # The tilt at the start is part of the segment: the body starts at angle 0.
+            # The body's angle starts at 0, with the plank at `tilt`; limits count from there.
             limit = radians(self.tool.max_angle)
             tilt = start_tilt(self.tool)
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
-            # [code] It has no shape, so nothing hits it. A gear turns it with the plank [code].
-            weight = pymunk.Body(self.tool.mass, self.tool.mass)
+            # [code] Nothing hits it: it has no shape. The GearJoint turns it as the plank turns.
+            weight = pymunk.Body(self.tool.mass, self.tool.mass)  # mass, moment of inertia [code]
             weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
             fixtures += [weight, pivot, pymunk.GearJoint(self.body, weight, 0.0, 1.0)]
@@ -736,7 +736,7 @@ def _on_goal(arbiter, space, data) -> None:
 
 
 def _on_carrier(arbiter, space, data) -> None:
-    """On a belt or a ladder a ball moves as they do."""
+    """A ball on a belt or a ladder gets its velocity at every step, so it does not fall through."""
     mover, carrier = (shape.owner for shape in arbiter.shapes)
     aim = radians(carrier.tool.angle)
     lean = LADDER_LEAN if carrier.kind.contact == LADDER else 1.0
@@ -806,8 +806,8 @@ def make_space() -> pymunk.Space:
     # begin: once per contact. pre_solve, post_solve: at every step, before and after the forces.
     # A target that stays on a goal is noted anew: `_judge` forgets the touch after each action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
-    # Of two balls once is enough: a marker's touch is never forgotten, and no task has a marker and
-    # a ball as goal (keep it so), so the first touch of a goal ball ends the episode.
+    # Of two balls once is enough: a marker's touch is never forgotten, and that of a goal ball ends
+    # the episode. With a marker it would not (and be lost): keep tasks to one or the other.
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
     space.on_collision(MOVING, LADDER, pre_solve=_on_carrier)
@@ -898,7 +898,7 @@ def draw(canvas: Canvas, tool: Tool, place: Vec2d, angle: float = 0.0) -> None:
             canvas.line([*corners, corners[0]], 1.0, colour)
         case "Goal star" if canvas.in_colour:  # in grey the pentagon that balls have to touch
             canvas.polygon([corners[k] for k in (0, 2, 4, 1, 3)], colour)
-            canvas.stroke([place], 2.8, colour)
+            canvas.stroke([place], 2.8, colour)  # Pillow leaves the middle of the star empty
         case "Ladder":
             canvas.line(corners, 2.0, colour)
             for u in np.arange(1.0 - half, half, 2.0).tolist():
@@ -935,7 +935,7 @@ class CreateEnv(gym.Env):
     Every action places at most one tool, which then stays; after it 40 physics steps (1.33 s) run.
 
     ## Action Space
-    `Dict(choice=Discrete(K), position=Box(-1, 1, (2,), float32))`: a place in `available`, and
+    `Dict(choice=Discrete(K), position=Box(-1, 1, (2,), float32))`: an index of `available`, and
     where to put the tool's centre (norm). Choice 0 is always the no-op. `step` also accepts
     positions outside of the Box, as an unclipped Gaussian policy makes them: the tool is refused.
     `placement` tells what came of it: "placed", "waited", "outside", "too close" or "blocked".
@@ -989,7 +989,7 @@ class CreateEnv(gym.Env):
         super().reset(seed=seed)
 
         # Subsampling: every episode has its own few tools of the pool. If all are to be available,
-        # nothing is drawn. (In tests of the Full Split [code] draws a class first; [here] not.)
+        # nothing is drawn. (Full Split's tests: [code] draws a class first; [here] as appendix.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
@@ -1127,8 +1127,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. The target may be there before the hit (by a fan, in obstacle). [code]
-        # counts this touch when the hit comes; [here] not: the hit is to bring the target there.
+        # Then the goal. A touch in an action before the hit (by a fan, in obstacle) is forgotten,
+        # unless it lasts. [code] counts it; [here] not: the hit is to bring the target there.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1146,7 +1146,7 @@ class CreateEnv(gym.Env):
     def _pay(self, goal_reached: bool, subgoals_reached: int, hit_now: bool) -> float:
         """The reward, A.3 Equation 3: alive, goal, subgoals, target hit, invalid, overlap."""
         # appendix: products of the bonus terms, which would pay nothing before the goal. [code]
-        # sums and takes 0.1 per placed tool from the rewards of goal and subgoals. [here] sums.
+        # sums, and takes off 0.1 per placed tool. [here] sums; the appendix has no cost of tools.
         reward = LAMBDA_ALIVE + REFUSED.get(self.placement, 0.0)
         reward += goal_reached * LAMBDA_GOAL  # an indicator of Eq. 3 is True or False, 1 or 0
         # C.3 switches off the rewards of subgoals. Figure 10 has push too, a task without subgoals,
@@ -1237,7 +1237,7 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 # ---- A.3, B action observations: the probe ball ----
 
-PROBE_ATTEMPTS = 8  # [code] launches at most, until the ball touches the tool
+PROBE_ATTEMPTS = 8  # [code] launches of a ball that misses the tool; the last one is kept
 PROBE_STEPS = 90  # [code] physics steps per launch
 PROBE_EVERY = 10  # [code] a state is recorded after steps 10, 20, ..., 90
 PROBE_LENGTH = 7  # A.3 "ball trajectories of length 7", cut out of the 9 recorded states
@@ -1246,9 +1246,9 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# The scale of the numbers for hvae.py. It reads the first state as (x - centre) / half_width, each
-# later one as (x - the one before) / step, velocities likewise. [here] step is 4 pixels: the
-# decoder's log-variance is at least -4, its deviation exp(-4 / 2) = 0.135 steps, half a pixel.
+# The scale of the numbers for hvae.py: a first state becomes (x - centre) / half_width, differences
+# between states are divided by step. [here] step is 4 pixels: the decoder's deviation is at least
+# exp(-4 / 2) = 0.135 (see hvae.py) of it, so half a pixel is as exact as it can be.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1289,12 +1289,12 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
     tool = TOOLS[action]
     rng = np.random.default_rng([seed, action])
     places = rng.uniform(-PROBE_AREA, PROBE_AREA, (n, 2))  # norm, of the tool in each trajectory
-    trajectories = np.zeros((n, PROBE_LENGTH, 7), np.float32)
+    trajectories = np.zeros((n, PROBE_LENGTH, 7), np.float32)  # of "state" 6; a plank's angle
     missing = np.arange(n)  # trajectories that are still to be recorded
     attempt = 0
     while len(missing):
-        # A ball starts anywhere and flies at the tool's centre. [code] Its speed grows with the
-        # distance, and by 40 % of the first with every attempt; then it varies by 40 % up and down.
+        # A ball starts anywhere and flies at the tool's centre. [code] Its speed is 12.5 * (1 + 0.4
+        # * attempt) * (1 + distance), times a random factor from 0.6 to 1.4.
         start = rng.uniform(-1.0, 1.0, (len(missing), 2))
         gap = places[missing] - start
         distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (missing, 1) norm

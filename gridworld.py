@@ -149,7 +149,7 @@ def walk(grid: list[int], cell: int, skill: int) -> list[int]:
         if grid[cell + offset] != WALL:
             cell += offset
         cells.append(cell)
-        # Lava ends the game in the middle of a skill (A.1), and so does the goal [code].
+        # A.1: lava ends the game even in the middle of a skill; [code] the goal does, too.
         if grid[cell] in (GOAL, LAVA):
             break
     return cells
@@ -160,10 +160,10 @@ class GridWorldEnv(gym.Env):
     """Lava crossing with five-move skills (appendix A.1).
 
     One row or column (3, 4 or 5) is lava with one opening, the subgoal. A move into a wall does
-    nothing, but counts. The best return (below) is for gamma = 1, and needs suitable skills.
+    nothing, but counts.
 
     ## Action Space
-    `Discrete(K)`: a position in `available`.
+    `Discrete(K)`, K = `num_available`: action k carries out the skill `available[k]`.
 
     ## Observation Space
     `Dict(state=Box(0, 11, (81,), uint8), available=Box(0, 1023, (K,), int64))`. `state[x * 9 + y]`
@@ -172,7 +172,8 @@ class GridWorldEnv(gym.Env):
 
     ## Rewards
     0.1 for entering the subgoal the first time, 1 - 0.9 N / 50 for entering the goal with move N
-    (Eq. 1, see `step`), else 0. The best return is 0.1 + 1 - 0.9 * 12 / 50 = 0.884 in every layout.
+    (Eq. 1, see `step`), else 0. The best return, with suitable skills and gamma = 1, is 0.1 + 1 -
+    0.9 * 12 / 50 = 0.884 in every layout.
 
     ## Starting State
     Agent at (1, 1), goal at (7, 7), one of 42 layouts, K skills drawn from `action_pool` without
@@ -219,7 +220,8 @@ class GridWorldEnv(gym.Env):
 
         # Every episode has its own random subset of the pool: the paper's *subsampling*. [code]
         # draws it from the system's entropy; [here] the seeded generator, so a run can be repeated.
-        # The order is random, too: the policy scores each skill by itself. A whole pool is sorted.
+        # The order is random, too, since the policy scores each skill by itself. Only a whole pool
+        # is sorted: then a policy with one output per action meets each at the same place.
         pool = self.action_pool
         self.available = pool
         if self.num_available < len(pool):
@@ -259,8 +261,8 @@ class GridWorldEnv(gym.Env):
             reward += 1 - LAMBDA_GOAL * moves / MAX_MOVES
 
         # End (A.1): goal, lava, or the limit. [here] the limit is `truncated`, gymnasium's word for
-        # an end that only a clock makes; [code] treats both alike, as a learner may here, too. A
-        # skill that nothing cuts has five moves, so the limit is met exactly.
+        # an end that only a clock makes; [code] does not tell the two apart, nor does
+        # ppo_actiongen.py: for it nothing comes after either. Ten skills are exactly 50 moves.
         terminated = success or entered[-1] == LAVA
         truncated = not terminated and moves >= MAX_MOVES
         self.over = terminated or truncated
@@ -289,10 +291,10 @@ gym.register("ActionGen/GridWorld-v0", entry_point="gridworld:GridWorldEnv")
 
 
 def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **options):
-    """A SyncVectorEnv of GridWorldEnv(action_pool, num_available, **options), which are seeded.
+    """A SyncVectorEnv of GridWorldEnv(action_pool, num_available, **options), seeded already.
 
     SAME_STEP: the step that ends an episode returns the first observation of the next one, and
-    infos["final_info"] holds `success`. Call `envs.reset()` without a seed, which would replace
+    infos["final_info"] holds `success`. Call `envs.reset()`; a seed given to it would replace
     `seed`. ValueError as in GridWorldEnv.
     """
 
@@ -307,10 +309,10 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 
 # ---- A.1 Action Observations: the world of the recordings ----
-# hvae.py scales recordings: first states to -1..1, (cell - centre) / half_width; moves from a state
-# to the next are divided by step, so they stay in cells. [here], because the least
-# standard deviation of the decoder is 0.135 [code], and a move of 1 is about 7 of them. In scaled
-# coordinates a move would be 0.025, lost in the noise.
+# hvae.py scales recordings: a first state becomes (cell - centre) / half_width, -1..1; differences
+# between states are divided by step, so they stay in cells. [here], because the decoder cannot be
+# more certain than a standard deviation of 0.135 [code]. A move of 1 cell is 7 times as large; a
+# scaled move of 1 / 39.5 = 0.025 would be lost in it.
 UNITS = dict(centre=39.5, half_width=39.5, step=1.0)
 
 
@@ -399,7 +401,8 @@ def draw_frame(env: GridWorldEnv, moves: int) -> np.ndarray:
 
 def draw_sheet(path: Path, skills: np.ndarray, seed: int) -> None:
     """A PNG: the layouts, where skills lead, recordings of one of `skills` per quadrant."""
-    # Imported here: training needs no pictures. A notebook's backend could make the import fail.
+    # Imported here: training needs no pictures. A notebook sets MPLBACKEND, perhaps to a backend
+    # that is not installed here, and the import would fail.
     os.environ.pop("MPLBACKEND", None)
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
@@ -414,11 +417,11 @@ def draw_sheet(path: Path, skills: np.ndarray, seed: int) -> None:
     labels = action_labels()
     for quadrant, color in QUADRANTS.items():
         ends = MOVE_DELTAS[SKILL_MOVES[labels == quadrant]].sum(1)  # (256, 2)
-        cells, counts = np.unique(ends, axis=0, return_counts=True)
-        middle.scatter(*cells.T, 7 * counts, color)
+        places, counts = np.unique(ends, axis=0, return_counts=True)  # (places, 2), (places,)
+        middle.scatter(*places.T, 7 * counts, color)
         skill = skills[labels[skills] == quadrant][0]
         paths = action_observations([skill], 40, seed=seed)[0]  # (40, 6, 2)
-        right.plot(*paths.T, color=color)
+        right.plot(*paths.T, color=color)  # x and y, (6, 40) each: a line per recording
         right.scatter(*paths[:, 0].T, 12, color, label=SKILL_NAMES[skill])
     middle.set(title="where all skills lead (area: how many)", aspect="equal", ylim=(5.5, -5.5))
     right.set(title="recordings (dot: start)", aspect="equal", xlim=(0, 79), ylim=(79, 0))

@@ -65,7 +65,8 @@ TRANSITIONS = np.array(
 CUMULATIVE = TRANSITIONS.cumsum(1)  # (3, 3), for drawing the next session
 
 # ---- A.2 Actions and action set split ----
-# Products are the same in every run. No other seed spells "products", so they equal no user.
+# Products are the same in every run. The letters of "products", as numbers, are part of the seed:
+# no environment draws the same random numbers for its users.
 # [here] 21 is the first number with which the mean mu_i of training, validation and test products
 # of split seed 0 all lie within 0.03 of 0, so that scores of the parts can be compared. Other split
 # seeds are not balanced.
@@ -74,7 +75,7 @@ PRODUCTS = _rng.standard_normal((NUM_ACTIONS, DIM))  # c_i
 
 # appendix: c ~ N(0, I), of length about 4; [code] scaled to length 1, and so [here]. For a user v,
 # call c_i . v the *taste* for product i, and mu_i its *popularity*. With length 4, taste (std 4)
-# would outweigh popularity (std 3), and little would be hidden; with length 1 its std is 1.
+# would outweigh popularity (std 3), and little would be hidden; with length 1 its std starts at 1.
 PRODUCTS /= np.linalg.norm(PRODUCTS, axis=1, keepdims=True)
 POPULARITY = _rng.normal(0.0, MU_STD, NUM_ACTIONS)  # mu_i, hidden from the agent
 
@@ -87,7 +88,7 @@ def action_labels() -> np.ndarray:
 def engineered_representations(fully_observable: bool = False) -> np.ndarray:
     """What the policy may know about each product, float32.
 
-    (10_000, 16): the vectors c_i (A.2). `fully_observable`, (10_000, 17): then mu_i / MU_STD (C.5).
+    (10_000, 16): the vectors c_i (A.2). `fully_observable` adds a 17th number, mu_i / MU_STD (C.5).
     """
     if not fully_observable:
         return PRODUCTS.astype(np.float32)
@@ -159,9 +160,9 @@ class RecSysEnv(gym.Env):
 
     ## Episode End
     `terminated` when the user leaves, at once or from the organic session that follows: after a
-    click 0.01 / 0.26 = 0.0385, else 0.01 + 0.05 * 0.0385 = 0.0119; who leaves before the first
-    recommendation still gets that one. `truncated` after 100. The last info holds `ctr`: clicks /
-    recommendations, the mean reward of a step.
+    click with probability 0.01 / (0.25 + 0.01) = 0.0385, else 0.01 + 0.05 * 0.0385 = 0.0119. Who
+    leaves before the first recommendation still gets that one, and a click brings them back.
+    `truncated` after 100. The last info holds `ctr`: clicks / recommendations, the mean reward.
 
     ## Arguments
     `action_pool`: distinct ids that `available` is drawn from (default: training products).
@@ -180,13 +181,14 @@ class RecSysEnv(gym.Env):
         self.num_available = num_available
         self.render_mode = render_mode
         self.observation_space = gym.spaces.Dict(
-            # appendix: v_user; [code] v_user / norm, then running mean and std; [here] v_user, for
-            # the learner to scale. [here] 100: never met, but gymnasium warns of unbounded spaces.
+            # appendix: v_user; [code] v_user / its length, minus a running mean, / a running std;
+            # [here] v_user, for the learner to scale. 100 is never met, but gymnasium warns of
+            # unbounded spaces.
             state=gym.spaces.Box(-100, 100, (DIM,), np.float32),
             available=gym.spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
         )
         self.action_space = gym.spaces.Discrete(num_available)
-        self.ending = "not started"  # why there is nothing to step in; "" during an episode
+        self.ending = "not started"  # why no episode is running; "" while one is
 
     def reset(self, *, seed=None, options=None):
         """A new user, who looks around alone first; returns (observation, {})."""
@@ -223,8 +225,9 @@ class RecSysEnv(gym.Env):
 
         # Click or not (Eq. 2), with the user vector that the agent has seen: it changes afterwards.
         # The appendix says that a product is unlikely to be clicked twice, because the user drifts.
-        # [code] has no rule against repeats, nor is there one here: repeating the product that is
-        # best at the start comes within 0.01 of the oracle's CTR (see POLICIES; the tests).
+        # That does not hold in [code], which has no rule against repeats, nor here: a policy that
+        # repeats the product that was best at the start loses less than 0.01 of the oracle's CTR
+        # (tests/test_recsys.py).
         product = self.available[action]
         x = PRODUCTS[product] @ self.user + POPULARITY[product]  # (16,) @ (16,) -> ()
         click = bool(self.np_random.random() < click_probability(x))
@@ -241,8 +244,9 @@ class RecSysEnv(gym.Env):
             self.session = ORGANIC
         self._organic_session()
 
-        # End (A.2): the user left, or the limit. [code] treats both alike, as a learner may here,
-        # too; [here] the limit is `truncated`, gymnasium's word for an end that only a clock makes.
+        # End (A.2): the user left, or the limit. [here] the limit is `truncated`, gymnasium's word
+        # for an end that only a clock makes; [code] does not tell the two apart, nor does
+        # ppo_actiongen.py: for it nothing comes after either.
         terminated = self.session == GONE
         truncated = not terminated and len(self.clicks) == MAX_RECOMMENDATIONS
         info = {}
@@ -292,10 +296,10 @@ gym.register("ActionGen/RecSys-v0", entry_point="recsys:RecSysEnv")
 
 
 def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **options):
-    """A SyncVectorEnv of RecSysEnv(action_pool, num_available, **options), which are seeded.
+    """A SyncVectorEnv of RecSysEnv(action_pool, num_available, **options), seeded already.
 
     SAME_STEP: the step that ends an episode returns the first observation of the next one, and
-    infos["final_info"] holds `ctr`. Call `envs.reset()` without a seed, which would replace
+    infos["final_info"] holds `ctr`. Call `envs.reset()`; a seed given to it would replace
     `seed`. ValueError as in RecSysEnv.
     """
 
@@ -312,9 +316,10 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 # ---- floors and ceilings: what simple policies reach, to compare a trained one with ----
 # Each policy scores the available products, (K,), from taste c.v (K,) and popularity mu (K,); the
 # best is recommended. random is the floor. c-only knows c and v, not mu: the ceiling for unseen
-# products while mu is hidden, for a policy that remembers no clicks. The oracle knows mu, too, and
-# always recommends the likeliest click; it does not plan ahead. The numbers are the CTR with 500
-# available test products (10,000 episodes, default seed 5; standard errors 0.002).
+# products while mu is hidden, since c says nothing about mu (for a policy that remembers no
+# clicks). The oracle knows mu, too, and always recommends the likeliest click; it does not plan
+# ahead. The numbers are the CTR with 500 available test products (10,000 episodes, this script's
+# default seed, 5; standard errors 0.002).
 POLICIES = {
     "random": lambda taste, mu, rng: rng.random(len(mu)),  # 0.158
     "c-only": lambda taste, mu, rng: taste,  # 0.302

@@ -86,18 +86,18 @@ AXIS_GAP = (1.0, 1.6)  # m [code]: from one axis to the other
 
 # ---- physics: the appendix names only the 300 steps ----
 SIM_STEPS = 300  # A.4: "acts every 300 physics simulator steps"
-# [code] has density 1000, so that masses differ 1000-fold; [here] every shape has mass 1 and the
-# inertia of its form, because large ratios break Bullet's solver: five cubes, each larger than the
-# one below, fall within 3 s with masses by density and stand with mass 1.
+# [code] has one density, so the largest shape is 1000 times as heavy as the smallest; [here] every
+# shape has mass 1 and the inertia of its form. Large ratios break Bullet's solver, which finds the
+# forces of contacts step by step: five cubes, each larger than the one below, then fall in 3 s.
 MASS = 1.0
 # Friction between two bodies: [code] has 2 (sliding), 2 (spinning about the contact normal) and .25
 # (rolling), which is close to glue; [here] 1, .1 and .05, because spheres then come to rest, but
-# the class of a shape still decides what can stand on it. From the values of one body, below,
+# the class of a shape still decides what can stand on it. CONTACT holds the values of one body.
 # Bullet makes those of a pair: 1 x 1, .05 + .05 and .025 + .025. [code] Nothing bounces.
 CONTACT = dict(lateralFriction=1.0, spinningFriction=0.05, rollingFriction=0.025, restitution=0)
 # A.4 always simulates 300 steps; [here] only until all is at rest. This is not only a saving but a
 # part of the task: in the steps that are left out, small errors of the solver would shear a tower
-# apart that already stands. `greedy_plan` reaches a mean height of 5.3 this way, and 4.7 with all
+# apart that already stands. `greedy_plan` builds 5.3 high on average this way, and 4.7 with all
 # 300 steps; random play is as high either way. At rest means: at two checks in a row, five steps
 # apart, every velocity is below REST_SPEED, and no two bodies overlap by REST_DEPTH or more.
 CHECK_EVERY = 5  # simulation steps
@@ -148,8 +148,8 @@ class Family:
 
     A class of A.4 consists of one or more of these families; families are [code]'s unit. What
     collides is, by `bullet_type`: the convex hull of `points` (MESH), boxes of eight points each,
-    or a round solid, which Bullet computes exactly; its `points` only sample the surface, for
-    drawing and for `top`.
+    or a sphere, capsule or cylinder, which Bullet computes exactly; there `points` only sample
+    the surface, for drawing and for `top`.
     """
 
     name: str  # [code]
@@ -159,7 +159,7 @@ class Family:
     turn: float = 0  # degrees: `num_angles` equally spaced angles in [0, turn)
     label: str = ""  # its class in Table 2, where that is not the name
     bullet_type: int = p.GEOM_MESH
-    moments: tuple = ()  # of inertia about x, y, z at scale 1 and mass 1; only of a round solid
+    moments: tuple = ()  # of inertia about x, y, z at scale 1 and mass 1, if computed exactly
     same_as: str = ""  # the family that has the same solid, on another face or as a plain copy
 
     def parts(self) -> np.ndarray:
@@ -272,9 +272,9 @@ def mass_properties(family: Family) -> tuple:
     shares = volumes / volumes.sum()
     com = shares @ tetrahedra.mean(axis=1)  # (T,) @ (T, 3) -> (3,)
     # The inertia matrix is trace(m) I - m, where m is the mean of x x^T over the solid, x counted
-    # from the centre of mass. A point of a tetrahedron is a weighted mean of the corners v. Over
-    # all points, a squared weight has the mean 2/20 and the product of two weights 1/20, so x x^T
-    # has the mean (sum of v v^T + (sum of v) (sum of v)^T) / 20.
+    # from the centre of mass. A point of a tetrahedron is a weighted mean of the corners v. For
+    # uniform points a squared weight has the mean 2/20, the product of two weights 1/20 (moments of
+    # Dirichlet(1, 1, 1, 1)), so x x^T has the mean (sum of v v^T + (sum of v) (sum of v)^T) / 20.
     corners = tetrahedra - com
     total = corners.sum(axis=1)  # (T, 3)
     m = np.einsum("t,tvi,tvj->ij", shares, corners, corners)
@@ -337,9 +337,9 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
     # training shape of its family; all angles of a scale stay together. [code] draws per family;
     # [here] one draw decides for a solid (form and size) in all families that have it: else a cone
-    # would be in training and its copy, the other cone, in the test. Go through the families.
-    # What an earlier family has decided, for training or against it, stays. From the other solids
-    # draw until half of the family is in training: `cone-hires` draws half of its solids, so `cone`
+    # would be in training and its copy, the other cone, in the test. For each family: what earlier
+    # ones have decided, for training or against it, stays. Of its other solids so many are drawn
+    # that half of all its solids are in training: `cone-hires` draws half of its solids, so `cone`
     # finds all of its own decided; `rectangle` shares one with `horizontal_rectangle`.
     decided = set()
     train_solids = set()
@@ -355,14 +355,14 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     train = np.array([shape.solid_key() in train_solids for shape in SHAPES])
 
     # Full Split (Table 2): the class alone decides. The draw above is thrown away here, but still
-    # made: it advances `rng`; without it the halves would differ from those behind the stored
-    # results. One solid can be on both sides: a `hat` is a `triangle` on another face.
+    # made: it advances `rng`; without it the halves would differ from those in results/policies
+    # and results/*.csv. One solid can be on both sides: a `hat` is a `triangle` on another face.
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
-    # A.4: "randomly splitting the test set into half". Only shapes of one solid and one angle, like
-    # the two cones, stay together as a group; different angles may be in different halves. The
-    # groups are dealt in random order: to validation until it has its half, the others to the test.
+    # A.4: "randomly splitting the test set into half". Only exact copies, shapes of one solid and
+    # angle like the two cones, stay together as a group. The groups are dealt in random order: to
+    # validation while they fit into its half, else to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
     for shape_id in unseen:
@@ -441,11 +441,11 @@ def add_shape(bullet: Bullet, shape_id: int, origin: tuple, rgb: tuple) -> int:
         MASS, collision, visual, origin, p.getQuaternionFromEuler((0, 0, angle)),
         baseInertialFramePosition=(scale * com).tolist(),
         baseInertialFrameOrientation=axes.as_quat().tolist(),  # x, y, z, w
-        useMaximalCoordinates=1,  # plain rigid bodies, 1.4 times faster than Bullet's multibodies
+        useMaximalCoordinates=1,  # a body without joints: 1.4 times faster than a "multibody"
     )  # fmt: skip
 
-    # Bullet would take the inertia of the bounding box. The mass must be given along with ours:
-    # without it the body becomes massless and its pose NaN. [code] Nothing is damped.
+    # Bullet would take the inertia of the bounding box. With our inertia the mass must be repeated,
+    # or it becomes 0 and the pose NaN. -1 is the body itself (no joint). [code] Nothing is damped.
     inertia = (MASS * scale**2 * moments).tolist()
     bullet.changeDynamics(
         body, -1, mass=MASS, localInertiaDiagonal=inertia, **CONTACT,
@@ -609,7 +609,7 @@ class StackingEnv(gym.Env):
         self._frames = []
         self._stack = np.zeros((FRAMES, SIZE, SIZE), dtype=np.uint8)  # black before the first one
 
-        # Two cylinders are dropped on it, "of random heights" (A.4); [code] one height for both.
+        # Two cylinders are dropped on it, "of random heights" (A.4): one height for both [code].
         cylinder = rng.choice(CYLINDERS)
         centre = rng.uniform(*CENTRE)
         gap = rng.uniform(*AXIS_GAP)
@@ -869,8 +869,8 @@ FLAT = ("horizontal_rectangle", "half_rectangle", "cube", "arch", "rectangle", "
 def greedy_plan(available: Sequence[int]) -> list[int]:
     """Positions in `available` of at most ten shapes, in order, for a high tower.
 
-    The shapes with flat top and bottom, largest first, then the tallest of the rest. All over one
-    cylinder they reach 5.1 to 5.4 on average, by the split; random play reaches 1.5 to 1.6.
+    The shapes with flat top and bottom, largest first, then the tallest of the rest. If all are
+    dropped over one cylinder, the mean is 5.1 to 5.4, by the split; of random play 1.5 to 1.6.
     """
 
     def rank(k):  # what is smaller comes first
