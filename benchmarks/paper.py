@@ -158,7 +158,7 @@ class Args:
     seeds: tuple[int, ...] = (0, 1, 2)  # published: 5 seeds, 8 in Grid World
     recipe: Literal["fast", "paper"] = "fast"  # of policies; paper: of Figures 4-6's encoders, too
     budget: float = 1.0  # factor on the recipe's number of environment steps
-    jobs: int = 1  # commands at a time
+    jobs: int = 1  # commands at a time; 0: only write the scores of what is finished
     dry_run: bool = False  # only print the commands
     runs_dir: str = "runs"  # where the runs live, from the repository's root
     results_dir: str = "results"  # where the tables go
@@ -229,8 +229,8 @@ def plan(args: Args) -> list[Job]:
     names = {(f, row): {row, *row.split("/")} for f in figures for row in TABLE[f]}
     for name in args.only:
         hvae.choose("row", name, sorted(set().union(*names.values())))
-    if not args.seeds or not args.budget > 0 or args.jobs < 1:
-        raise UserError("at least one seed, a budget above 0 and one job are needed")
+    if not args.seeds or not args.budget > 0 or args.jobs < 0:
+        raise UserError("at least one seed, a budget above 0, and no negative jobs are needed")
     chosen = [where for where, words in names.items() if not args.only or words & {*args.only}]
     # Seed by seed, so that an interrupted matrix is balanced.
     jobs = [expand(*where, seed, args) for seed in args.seeds for where in chosen]
@@ -380,7 +380,7 @@ def run_all(jobs: list[Job], args: Args) -> int:
             for job in list(waiting):
                 needed = [succeeded.get(need.command) for need in job.needs]
                 busy = [other.folder for other in running.values()]
-                if len(running) == args.jobs:
+                if len(running) == max(1, args.jobs):
                     break
                 if None in needed or job.folder in busy:  # one process in a folder
                     continue
@@ -409,9 +409,9 @@ def main(args: Args) -> None:
     if args.dry_run:
         print("\n".join(dict.fromkeys(job.command for job in jobs)))
         return
-    left = sum(not score_rows(job) for job in jobs)  # a folder of another run is an error now
-    print(f"{left} of {len(jobs)} commands to run", flush=True)
-    failures = run_all(jobs, args)
+    finished = [job for job in jobs if score_rows(job)]  # a folder of another run is an error now
+    print(f"{len(jobs) - len(finished)} of {len(jobs)} commands to run", flush=True)
+    failures = run_all(jobs if args.jobs else finished, args)
     if failures:
         raise SystemExit(f"error: {failures} of {len(jobs)} commands have no result")
 

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -127,6 +127,8 @@ def test_a_tiny_experiment_runs_once_until_its_checkpoint_changes(tmp_path, monk
     (path,) = (tmp_path / "runs").glob("*/evaluations.csv")
     for last, left in (r"\g<0>", 0), (",1\n", 1):  # a test of another checkpoint does not count
         path.write_text(re.sub(r",\d+\n$", last, path.read_text()))  # the last column: best_step
+        paper.main(replace(args, jobs=0))  # starts nothing
+        assert len(paper.read(path)) == 1
         paper.main(args)
         assert capsys.readouterr().out.startswith(f"{left} of 2 commands to run\n")
     assert len(paper.read(path)) == 2
