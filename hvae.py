@@ -13,8 +13,8 @@ none). The model, and its bound from the main paper, with c ~ q(c | X) and z_j ~
 Only recipe paper divides the last term by |X|; quick and fast divide by more (`kl_c_divisor`): a
 weaker KL, as in a beta-VAE, so that more dimensions of c carry information. The representation of
 an action is the mean of q(c | X). A split has three parts: train, valid, test. The networks learn
-from the first and CREATE's no-op; with `--train-on all`, the oracle encoder, from all three. After
-the last update all of these actions get a row of a table. Other actions keep zeros.
+from the first and CREATE's no-op; with `--train-on all`, the oracle encoder, from all three. In the
+end every action of the three parts and the no-op get a row of a table; all others keep zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # appendix B: the plain VAE baseline
@@ -27,7 +27,8 @@ Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed 
 NO_OP (an id), UNITS (see `prepare`); and
 
     split_actions(split, seed) -> {"train": ids, "valid": ids, "test": ids}
-    action_labels() -> (NUM_ACTIONS,); engineered_representations() -> (NUM_ACTIONS, D), known facts
+    action_labels() -> (NUM_ACTIONS,), engineered_representations() -> (NUM_ACTIONS, D): classes and
+        known facts, for scores and pictures; the encoder never sees them
     action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
 An observation is (L, F), L states of F numbers each. Of modality "onehot" it is (L, 2), a cell's x
@@ -59,8 +60,8 @@ from tqdm import tqdm
 # networks, in its order; its loss -> ObservationModel.forward; B -> prepare, VAE; D.1 -> fit;
 # Figures 4-6 -> plot_tsne. Table 4's "MLP hidden layers 3": D.3.1 gives each MLP its own depth.
 # Shapes: A actions in a batch, N recorded observations of each, n in an update, B = A * n; L states
-# per observation (a picture: 1), the first given, T = L - 1 predicted; F numbers of a state as the
-# networks read it (160 if one-hot, 288 features of a frame); C = Z sizes of c, z; H hidden width;
+# per observation, the first given, T = L - 1 predicted (a picture is 1 state, predicted); F numbers
+# of a state: as recorded or, in networks, 160 of a cell, 288 of a frame; C = Z of c, z; H hidden;
 # E size of an encoded observation: H, or H + L * F with --linear-path; S side of a picture.
 
 # Name on the command line -> module. (The Recommender, without encoder, is here to load tables.)
@@ -77,7 +78,7 @@ class Args:
     """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
 
     env: Annotated[str, tyro.conf.Positional]  # gridworld, create, stacking, or a file: my_env.py
-    modality: str  # create: state [code], places of tool and ball, its velocity; xy (B); video
+    modality: str  # create: state [code] (places of tool and ball, ball's velocity), xy (B), video
     recipe: Literal[RECIPES]  # which column of HYPERPARAMETERS gives the numbers
     hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline
     train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, on all parts
@@ -101,7 +102,7 @@ class Args:
     kl_warmup: float = 0.0  # share of the updates in which the weight of the KLs climbs to 1
     compact_lstm: bool  # a Bi-LSTM of half the width, directions concatenated (none in pictures)
     log_var_start: float | None  # initial log-variance of the decoder (None: from N(0, 1))
-    log_var_rate: float  # factor on the rate of log-variances that no network computes
+    log_var_rate: float  # factor on the learning rate of log-variances that are free parameters
 
 
 # ---- Tables 3 and 4 ----
@@ -118,7 +119,7 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     "learning_rate":       (1e-3,  1e-3,  1e-3),    # Table 4
     "hidden":              (64,    64,    64),      # Table 4
     "q_hidden":            (128,   128,   128),     # Table 4
-    "observations":        (64,    64,    1024),    # Table 4; more of them gave no better policy
+    "observations":        (64,    64,    1024),    # Table 4; 64: more gave no better policy
     # Observations of one action differ little: many small updates teach more than few large ones.
     # appendix: 1,024 (recorded or used?); [code] 45 to 672, by environment; [here] "paper": all.
     "batch_observations":  (4,     4,     1024),
@@ -138,8 +139,8 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
 # In place of rows above: the entry of the modality or, if there is none, of the environment.
 EXCEPTIONS = {
     "onehot": {"updates": (2_000, 4_000, 0)},  # it takes longer to learn what 160 numbers mean
-    # Without these changes the model ignored z (how the ball was launched): the squared error of a
-    # trajectory, in units of `step` (see prepare), stayed near 6.5; with all it is below 1.
+    # Before rates, counts and KL weights were changed, together, the model ignored z (how the ball
+    # was launched): its mean squared error, in units of `step` (see prepare), stayed near 6.5.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
@@ -241,17 +242,17 @@ def prepare(raw, args):
     later = raw[:, 1:]  # (B, T, F)
     moves = raw.diff(dim=1)  # (B, T, F)
     if args.modality == "onehot":
-        # The input has 80 zeros and ones for x and for y, the target one class number for each. In
-        # the first state class 40 is cell 40. Later it is "no change" (41: one cell right or down),
-        # in the input since the state before, in the target since the first.
+        # The input has 80 zeros and ones for x and for y, the target one class number for each.
         if args.relative:
+            # Of a later state class 40 is "no change", 41 one cell right or down: from the state
+            # before in the input, from the first state in the target.
             raw = torch.cat([first, moves + CLASSES // 2], 1)
             later = later - first + CLASSES // 2
         one_hot = nn.functional.one_hot(raw.long(), CLASSES)  # (B, L, 2, 80)
         return one_hot.flatten(2).float(), later.long()
     if not args.relative:
-        return raw, later
-    # UNITS, a dictionary: first states become (x - centre) / half_width; all else is divided by
+        return raw, later  # recipe paper: the numbers as they were recorded [code]
+    # UNITS, three numbers: first states become (x - centre) / half_width; all else is divided by
     # `step`. States should differ between actions by more than 0.135 `step`: the decoder's
     # log-variance is clamped at -4 (ObservationModel.forward), its sigma at exp(-4 / 2) = 0.135.
     units = getattr(load_environment(args.env), "UNITS", dict(centre=0, half_width=1, step=1))
@@ -358,7 +359,7 @@ class ActionInference(nn.Module):
         )
         # appendix: 3 layers; [code] 4 (a block of 3 and the output); [here] as the code.
         self.after = nn.Sequential(Residual(hidden, 3), nn.Linear(hidden, 2 * size))
-        self.norm = GlobalBatchNorm()  # [code] over mean and log-variance together
+        self.norm = GlobalBatchNorm()  # [code] one for mean and log-variance together
 
     def forward(self, h):
         # A mean ignores the order and takes any number: few in training, at the end all recorded.
@@ -377,7 +378,7 @@ class ObservationInference(nn.Module):
             Residual(hidden, 2), Residual(hidden, 2), nn.Linear(hidden, size), GlobalBatchNorm()
         )
         # appendix: networks output the log-variances of q(z|x,c) and the decoder; [code] these and
-        # that of p(z|c) are learned constants, at first from N(0, 1); [here] as the code.
+        # that of p(z|c) are learned constants, from N(0, 1); [here], too (but see log_var_start).
         self.log_var = nn.Parameter(torch.randn(size))
 
     def forward(self, *inputs):
@@ -426,8 +427,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0 is the picture, 1 its mask (see decode). An untrained picture is grey, worse
-        # than the first frame: the mask would fall to 0. [here] It starts white, like most pixels.
+        # Channel 0: the picture, 1: its mask (see decode). A grey start is worse than the first
+        # frame: the mask would fall to 0, nothing be learned. [here] It starts white, as most are.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -444,7 +445,7 @@ class ObservationModel(nn.Module):
         self.args = args
         features = shape[-1]  # F, of trajectories; other modalities correct these numbers below
         steps = shape[0] - 1  # T
-        log_vars = features  # shape of the decoder's: one a number or pixel, shared by all steps
+        log_vars = features  # of the decoder: one per number or pixel, the same at all steps
         if args.modality == "onehot":
             features = CLASSES * shape[-1]
         if args.modality in VISUAL:
@@ -508,7 +509,7 @@ class ObservationModel(nn.Module):
         return mask * picture + (1 - mask) * frame
 
     def forward(self, raw):
-        # Raw observations (A, n, ...) -> the three terms of the objective, each per observation.
+        # Raw observations (A, n, ...) -> the three terms of the objective.
         x, target = prepare(raw.flatten(0, 1), self.args)  # (B, ...), B = A * n
         start, h = self.encode(x)
         latents, kl_z, kl_c = self.infer(h.unflatten(0, raw.shape[:2]))
@@ -779,11 +780,10 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
             config["env"] = environment_name(config["env"])
     except Exception as error:  # archives, arrays and JSON each have errors of their own
         raise UserError(f"{path} is missing or no file of representations") from error
-    # A table of your own that names no split belongs to every split.
     actions = dict(env=environment_name(env), action_set=action_set(module))
     wanted = actions | dict(split=split, split_seed=split_seed)
     for key, value in wanted.items():
-        if config.get(key, value) != value:
+        if config.get(key, value) != value:  # a table that names no split belongs to every split
             raise UserError(f"{path} has {key} {config[key]!r}, wanted {value!r}: make it again")
     check_table(path, mean, module)
     if config.get("source") != source_hash(module):

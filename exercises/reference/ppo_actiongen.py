@@ -141,7 +141,7 @@ class Args:
     hidden_size: int = 64  # units in every hidden layer (Table 4)
     published_init: bool = True  # initial weights and biases of [code]; off: see Agent.__init__
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
-    bilinear: bool = False  # utility c . M s in place of an MLP [here]
+    bilinear: bool = False  # utility c . (M f_omega(s) + m) in place of an MLP [here]
     one_hot: bool = False  # integer states enter as one-hot vectors, not as numbers [here]
     small_pictures: bool = False  # half the size, inverted, three convolutions [here]
 
@@ -172,7 +172,8 @@ TABLE_3 = {
     "task": (None, None, "push", None),
     "placement": (None, None, None, "1d"),
     # D.2: the rate falls linearly over the training. In CREATE and Stacking over 100M steps [code],
-    # more than they train, so they end at .46 and .97 of it. Followed here: it made the scores.
+    # more than they train: at the end it is still .46 and .97 of its start. We follow [code], since
+    # the published scores were made with it.
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
@@ -220,7 +221,7 @@ FAST = {
         lr_decay_steps=None,  # the rate falls over the run, whatever its length
         hidden_size=256,  # which tool, and where: more to represent
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
-        num_minibatches=16,
+        num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
@@ -229,7 +230,7 @@ FAST = {
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
         clip_vloss=False,  # a value could move by clip_coef only, too little near 10
         total_timesteps=4_000_000,
-        eval_every=102_400,
+        eval_every=102_400,  # 40 evaluations
     ),
     "stacking": dict(
         published_init=False,  # as in Grid World; and ending a tower starts unlikely
@@ -237,7 +238,7 @@ FAST = {
         minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
         clip_vloss=False,  # as in CREATE: heights, too, are large against clip_coef
         total_timesteps=400_000,
-        eval_every=20_480,
+        eval_every=20_480,  # 20 evaluations
     ),
 }
 # --quick: this many steps, at least four evaluations, 500 test episodes, the encoder's quick
@@ -303,7 +304,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of a stream: the run's seed, the use and, while training, step and rank."""
+    """`n` seeds of a stream: the run's seed, the use; where it changes, the step; the rank."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -346,7 +347,7 @@ def cnn(frames, H, small):
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # every further tool makes all features larger: LayerNorm takes this factor away
+    if small:  # the more tools in the picture, the larger all features: LayerNorm undoes this
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
@@ -412,7 +413,8 @@ class Agent(nn.Module):
         else:
             self.obs_stats = RunningMeanStd(state.shape)
             width = math.prod(state.shape)
-            if args.one_hot:  # whatever the reset, Grid World's grid holds all kinds of cells
+            if args.one_hot:
+                # Which ids are there? One reset tells: every grid of Grid World has all kinds.
                 first_states = envs.reset()[0]["state"]
                 self.register_buffer("cell_ids", torch.as_tensor(first_states).unique())
                 width *= len(self.cell_ids)
@@ -660,7 +662,8 @@ def episode_means(episodes):
 
 def rollout(envs, obs, agent, num_steps):
     """Play T actions in each environment: a batch of (T, N, ...), the next obs, ended episodes."""
-    # Episodes do not end with the rollout: the next one goes on where this one stops.
+    # Episodes do not end with the rollout: the next one goes on where this one stops (but after a
+    # checkpoint all start anew: see train).
     transitions = []
     episodes = []
     for _ in range(num_steps):
@@ -695,12 +698,13 @@ def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
 
 
 def running_returns(rewards, dones, G, gamma):
-    """Discounted sums of the rewards up to now; only their spread is used (NormalizeReward).
+    """Discounted sums of the rewards up to now; only their spread is used.
 
     G <- gamma G + r at every step, 0 after an episode. Returns all G (T, N), and the last (N,).
     """
     # Why not the true returns, which look ahead? An episode's end may be still to come. All that is
-    # needed is a rough size of the returns, and sums up to now have it [code].
+    # needed is a rough size of the returns, and sums up to now have it [code] (so does gymnasium's
+    # NormalizeReward).
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
         G = gamma * G + rewards[t]
@@ -812,10 +816,11 @@ def train(args):
     while step < last_step:
         started = time.perf_counter()
         if starts_afresh:
-            # At first and after every checkpoint, all random numbers and all episodes start
-            # anew. So a run that goes on from a checkpoint equals one that was never interrupted.
-            # Episodes still running are dropped, their ends are never seen. The last iteration has
-            # learned from their beginnings, with `next_value` (below) in place of what was to come.
+            # At first and after every checkpoint, all random numbers and all episodes start anew.
+            # So a run that goes on from a checkpoint equals one that was never interrupted, and
+            # evaluations, which use PyTorch's generator as well, do not change the training.
+            # Episodes still running are dropped. The iteration before this one has learned from
+            # their first part, with the critic's `next_value` (below) in place of the rest.
             torch.manual_seed(seeds(1, args.seed, TORCH, step, RANK)[0])
             obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
             G = torch.zeros(N, device=device)  # see running_returns
@@ -902,7 +907,8 @@ def train(args):
         return {}
 
     # Test, once (Algorithm 2): the selected policy, frozen, on all parts of the split. The result
-    # is its score with test actions, which it has never met (C.2: with those it was adapted to).
+    # is its score with test actions, which it has never met. (In C.2 there is only "train", the
+    # test actions, which it was adapted to.)
     log.close()
     return finish(folder, agent, phases, step, seconds)
 
@@ -944,6 +950,7 @@ def evaluate(agent, phase, episodes, stream):
 # ---- which actions are available, and what is known about them ----
 
 # Options that an environment's make_vec (see make_envs) takes, by their names in Args.
+# (`fully_observable` is none of them: it changes the representations, see load_table.)
 OPTIONS = {"create": ("task", "subgoal_reward"), "stacking": ("placement",)}
 # How the encoders of --representation differ from hvae.py's defaults.
 ENCODERS = {"hvae": {}, "hvae-all": dict(train_on="all"), "vae": dict(hierarchical=False)}
@@ -957,7 +964,8 @@ def task_options(args):
 def with_no_op(action_pool, args):
     """The ids that can be available: those of the pool and, in CREATE, the no-op's (A.3).
 
-    No pool contains the no-op. CREATE adds it to every episode, as one of the K [code].
+    No pool contains the no-op. CREATE adds it to every episode, as one of the K [code]. It has a
+    representation like all others: of recordings in which nothing happens (see hvae.py).
     """
     no_op = getattr(hvae.load_environment(args.env), "NO_OP", None)
     return action_pool if no_op is None else np.union1d(action_pool, [no_op])
@@ -990,7 +998,7 @@ def action_phases(args):
     # "learn": the policy is trained; "train": it is scored on the same actions; "valid": selects
     # the checkpoint; "test": scored once, at the end. K random actions of the pool are available in
     # an episode: num_available in "learn" (fast Grid World: 20), eval_available elsewhere (50). In
-    # C.2 (adapt) there are only "learn" and "train", with the test actions of all other runs.
+    # C.2 (adapt) there are only "learn" and "train"; their pool is what all other runs call "test".
     action_pool = split["test"] if args.adapt else split["train"]
     learn_K = args.num_available
     eval_K = args.eval_available or learn_K
@@ -1062,7 +1070,7 @@ def load_table(args):
 
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
-    # Another split would make "new actions" of some that the old policy was trained with. Options
+    # With another split, the old policy would have been trained with some "new" actions. Options
     # that decide the sizes of layers are not compared here: `put` names the layers that do not fit.
     theirs = load(folder / "best.pt")
     for name in ("env", "method", "split", "split_seed"):
@@ -1143,8 +1151,8 @@ def claim_folder(args):
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
     # Two processes in one folder would mix their rows. The operating system ends a lock with its
-    # process, however that ends. atexit keeps the lock: it would be released, too, when no variable
-    # holds it any more. (is_singleton: within one process, claiming it twice is no conflict.)
+    # process, however that ends. It would also end with the object `lock`, so atexit keeps it.
+    # (is_singleton: within one process, claiming it twice is no conflict.)
     lock = FileLock(folder / ".lock", is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -1306,7 +1314,7 @@ class EvaluateArgs:
     run: tyro.conf.Positional[str]  # the run's folder
     actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
     num_available: int | None = None  # K; None: as in the run's own test
-    min_angle_gap: float | None = None  # CREATE: only tools this many degrees from training tools
+    min_angle_gap: float | None = None  # CREATE: tools at least so many degrees from all known
     min_embedding_distance: float | None = None  # share: .3 leaves out the 30 % nearest to known
     unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
     episodes: int = 5000  # episodes to play
