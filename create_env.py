@@ -505,8 +505,8 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # The marker rolls down to the right, past falling boxes. It has to reach the subgoal there and
-    # to come back below to the target, which then rolls down to the star.
+    # Two pairs of boxes fall. One bars the marker's way to the subgoal at the right, and back below
+    # it to the target; the other the target's way down to the star. Tools have to catch both first.
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
