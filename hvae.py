@@ -11,10 +11,10 @@ none). The model, and its bound from the main paper, with c ~ q(c | X) and z_j ~
                            - KL(q(c | X) || N(0, I)) / |X|
 
 Only recipe paper divides the last term by |X|; quick and fast divide by more (`kl_c_divisor`): a
-weaker KL, as in a beta-VAE, so that more dimensions of c carry information. The representation of
-an action is the mean of q(c | X). A split has three parts: train, valid, test. The networks learn
-from the first and CREATE's no-op; with `--train-on all`, the oracle encoder, from all three. In the
-end every action of the three parts and the no-op get a row of a table; all others keep zeros.
+weaker KL (a beta-VAE, beta < 1), so that more dimensions of c carry information. The representation
+of an action is the mean of q(c | X). A split has three parts: train, valid, test. The networks
+learn from the first and CREATE's no-op; with `--train-on all`, the oracle encoder, from all three.
+In the end every action of the three and the no-op get a row of a table; all others keep zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # appendix B: the plain VAE baseline
@@ -132,7 +132,7 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     "compact_lstm":        (True,  True,  False),
     # RAdam moves a parameter by about the learning rate per update at most: 1e-3 is too slow for a
     # log-variance that has to fall from 0 to the clamp at -4 (ObservationModel.forward). So the
-    # decoder's starts lower, and it learns 10 times as fast; so do those of z (not tried singly).
+    # decoder's starts lower; it and those of z learn 10 times as fast (neither was tried alone).
     "log_var_start":       (-2.0,  -2.0,  None),
     "log_var_rate":        (10.0,  10.0,  1.0),
 }
@@ -378,7 +378,7 @@ class ObservationInference(nn.Module):
             Residual(hidden, 2), Residual(hidden, 2), nn.Linear(hidden, size), GlobalBatchNorm()
         )
         # appendix: networks output the log-variances of q(z|x,c) and the decoder; [code] these and
-        # that of p(z|c) are learned constants, from N(0, 1); [here], too (but see log_var_start).
+        # that of p(z|c) are learned constants, from N(0, 1); [here], too (but the decoder's start).
         self.log_var = nn.Parameter(torch.randn(size))
 
     def forward(self, *inputs):
@@ -427,8 +427,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0: the picture, 1: its mask (see decode). A grey start is worse than the first
-        # frame: the mask would fall to 0, nothing be learned. [here] It starts white, as most are.
+        # Channel 0: the picture, 1: its mask (see decode). An untrained picture is grey, worse than
+        # the first frame: the mask would fall to 0, nothing be learned. [here] It begins white.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -537,7 +537,7 @@ class HVAE(ObservationModel):
         self.p_z = ObservationInference((size,), args.hidden, size)
         self.apply(initialise)
 
-    def posterior(self, h):  # q(c | X): encoded observations (A, N, E) -> Gaussian of c, (A, C)
+    def posterior(self, h):  # q(c | X): encoded observations (A, n or N, E) -> Gaussian (A, C)
         return self.add_linear_path(self.q_c(h), h.mean(1))
 
     def represent(self, h):  # (A, N, E) -> representations (A, C)
@@ -564,7 +564,7 @@ class VAE(ObservationModel):
         self.q_z = ObservationInference((self.encoded_size,), args.hidden, size)
         self.apply(initialise)
 
-    def posterior(self, h):  # q(z | x): encoded observations (A, N, E) -> Gaussians, (A, N, Z)
+    def posterior(self, h):  # q(z | x): encoded observations (A, n or N, E) -> (A, n or N, Z)
         return self.add_linear_path(self.q_z(h), h)
 
     def represent(self, h):  # (A, N, E) -> (A, N, Z) -> representations (A, Z)
@@ -703,7 +703,7 @@ def train(args: Args) -> Path:
     if args.compact_lstm and args.hidden % 2:
         raise UserError("compact_lstm halves hidden, which must be even")
     split = module.split_actions(args.split, args.split_seed)
-    parts = np.concatenate(list(split.values())).astype(int)  # [] alone would be float
+    parts = np.concatenate(list(split.values())).astype(int)  # an empty list would make it float
     if len(np.unique(parts)) < len(parts):
         raise UserError(f"the parts of split {args.split!r} overlap")
     # CREATE's no-op, always available, is in no part of a split, but an action like others (A.3).

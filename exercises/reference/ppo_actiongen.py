@@ -38,7 +38,7 @@ then what surrounds them: which actions are available, checks, the run's folder,
 Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
 A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
 f_omega(s). A step is one action of one environment. A *score* is one number per episode (success,
-click-through rate, height): its last info has it, under the name METRIC of the environment's file.
+click-through rate, height): its last info has it; METRIC in the environment's file is its key.
 Two marks: [code] is the authors' released program, followed where the appendix is silent (where the
 two disagree, a comment says which one is followed); [here] is a choice of this repository, with its
 reason.
@@ -105,7 +105,7 @@ class Args:
     split_seed: int = 0  # seed of that division [code: one division for all seeds]
     task: str | None = None  # CREATE: one of its twelve tasks (C.1)
     subgoal_reward: bool = True  # CREATE: reward for the subgoal (off: C.3)
-    placement: str | None = None  # Stacking: coordinates the policy chooses: none, 1d, 2d (C.6)
+    placement: str | None = None  # Stacking: what it chooses of a place: "none", "1d" or "2d" (C.6)
     fully_observable: bool = False  # Recommender: representations hold the constant mu_i, too (C.5)
 
     # --- action representations ---
@@ -135,11 +135,11 @@ class Args:
     vf_coef: float = 0.5  # weight of the value loss
     clip_vloss: bool = True  # clip the value's changes as well [code]
     ent_coef: float = 0.05  # weight of the entropy bonus (Table 3); 0: w/o entropy
-    ent_floor: float = 1.0  # ent_coef falls with the learning rate, to this fraction [here]
+    ent_floor: float = 1.0  # ent_coef falls linearly to this fraction; 1: it stays [here]
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
-    published_init: bool = True  # initial weights and biases of [code]; off: see Agent.__init__
+    published_init: bool = True  # small first weights, as in [code]; off: see Agent.__init__
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . (M f_omega(s) + m) in place of an MLP [here]
     one_hot: bool = False  # integer states enter as one-hot vectors, not as numbers [here]
@@ -304,7 +304,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of a stream: the run's seed, the use; where it changes, the step; the rank."""
+    """`n` seeds of a stream: (run's seed, use[, step[, rank]]), as far as the caller gives them."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -483,8 +483,8 @@ class Agent(nn.Module):
         if self.is_image:  # grey levels 0..255 -> 0..1
             encoding = self.encoder(state.float() / 255)
             return encoding, self.critic(encoding).squeeze(1)
-        # If the numbers of a state are ids of cells, a one-hot vector for each of them says more
-        # than the number. All others are brought to mean 0 and standard deviation 1 [code].
+        # With one_hot each number, the id of a cell, becomes a one-hot vector. Without it, every
+        # number is brought to mean 0 and standard deviation 1 [code].
         if self.args.one_hot:
             number = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
             x = F.one_hot(number, len(self.cell_ids)).flatten(1).float()  # (B, cells * ids)
@@ -522,11 +522,11 @@ class Agent(nn.Module):
         action_part = F.linear(self.table[ids], weight, bias)  # (U, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
-        # into the processor's cache, so b rows at a time are made, 800,000 numbers (3 MB) [here].
+        # into the processor's cache, so b = `piece` states at a time: 800,000 numbers, 3 MB [here].
         piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
         for states, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
-            actions = action_part.index_select(0, rows.flatten())  # action_part[rows]: (b * K, H)
+            actions = action_part.index_select(0, rows.flatten())  # (b * K, H)
             hidden = states[:, None] + actions.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
             logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
         return torch.cat(logits) + self.utility_out.bias
@@ -614,7 +614,7 @@ class Agent(nn.Module):
 
 # 1. Train the encoder on training actions, then compute c_i for all actions (hvae.py).
 # 2. Repeat: at every reset draw K training actions; play; update by PPO with an entropy bonus;
-#    every eval_every steps score on validation actions, and keep the best policy.
+#    every eval_every steps, at a *checkpoint*, score on validation actions; keep the best policy.
 # Algorithm 2 is evaluate(): the kept policy with K unseen actions per episode, nothing is learned.
 
 
@@ -636,28 +636,6 @@ def play_step(envs, obs, agent):
     transition["reward"] = torch.as_tensor(reward).to(value)
     transition["done"] = torch.as_tensor(terminated | truncated).to(value)  # 1.0 or 0.0
     return transition, obs, infos
-
-
-def ended_episodes(infos, args):
-    """(number of the environment, score, return, length) of every episode that ended just now."""
-    # An environment whose episode ends is reset within the same step. What it said at the end is in
-    # "final_info"; return and length are added by gymnasium's RecordEpisodeStatistics.
-    if "episode" not in infos:
-        return []
-    metric = hvae.load_environment(args.env).METRIC
-    if metric not in infos.get("final_info", {}):
-        raise UserError(f"the last info of an episode does not hold the metric {metric!r}")
-    scores = infos["final_info"][metric]
-    episode = infos["episode"]
-    ended = np.flatnonzero(infos["_episode"])
-    return [(n, scores[n], episode["r"][n], episode["l"][n]) for n in ended]
-
-
-def episode_means(episodes):
-    """Mean score, return and length of `ended_episodes`; None for each if there are none."""
-    if not episodes:
-        return None, None, None
-    return np.mean(episodes, axis=0)[1:].tolist()
 
 
 def rollout(envs, obs, agent, num_steps):
@@ -865,10 +843,9 @@ def train(args):
         step += rollout_size
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
-        # with actions which neither encoder nor policy was trained on. Test actions do not select:
-        # the best of many noisy scores is too high by luck, so the score that is reported has to
-        # come from actions that had no part in the choice.
-        # (Only the oracle encoder, hvae-all, was trained on all actions.)
+        # with actions which neither encoder (but for hvae-all) nor policy was trained on. Test
+        # actions do not select: the best of many noisy scores is too high by luck, so the score
+        # that is reported has to come from actions that had no part in the choice.
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
@@ -881,8 +858,8 @@ def train(args):
             if valid_score > best_score:
                 best_score = valid_score
                 best = dict(args=vars(args), step=step, agent=agent.state_dict())
-                # hvae.write calls torch.save(best, file), with a new file that gets its name when
-                # it is whole. So a process that is killed leaves no half file.
+                # hvae.write gives what torch.save(best, file) writes its name when it is whole. So
+                # a process that is killed leaves no half file.
                 hvae.write(folder / "best.pt", partial(torch.save, best))
 
         # Record what happened (under torchrun: to the environments of rank 0).
@@ -947,6 +924,28 @@ def evaluate(agent, phase, episodes, stream):
     return dict(means, stderr=float(stderr), episodes=episodes)
 
 
+def ended_episodes(infos, args):
+    """(number of the environment, score, return, length) of every episode that ended just now."""
+    # An environment whose episode ends is reset within the same step. What it said at the end is in
+    # "final_info"; return and length are added by gymnasium's RecordEpisodeStatistics.
+    if "episode" not in infos:
+        return []
+    metric = hvae.load_environment(args.env).METRIC
+    if metric not in infos.get("final_info", {}):
+        raise UserError(f"the last info of an episode does not hold the metric {metric!r}")
+    scores = infos["final_info"][metric]
+    episode = infos["episode"]
+    ended = np.flatnonzero(infos["_episode"])
+    return [(n, scores[n], episode["r"][n], episode["l"][n]) for n in ended]
+
+
+def episode_means(episodes):
+    """Mean score, return and length of `ended_episodes`; None for each if there are none."""
+    if not episodes:
+        return None, None, None
+    return np.mean(episodes, axis=0)[1:].tolist()
+
+
 # ---- which actions are available, and what is known about them ----
 
 # Options that an environment's make_vec (see make_envs) takes, by their names in Args.
@@ -974,7 +973,8 @@ def with_no_op(action_pool, args):
 def make_envs(args, phase, num_envs, stream):
     """Environments for a phase, (action_pool, K available), and their first observation."""
     # make_vec gives every environment a generator of its own, seeded by `stream`, so reset needs no
-    # seed. (Training seeds them again after every checkpoint.) Each reset draws K ids of the pool.
+    # seed. (Training seeds them anew, with its rank, at first and after every checkpoint.) Each
+    # reset draws K ids of the pool.
     action_pool, K = phase
     make_vec = hvae.load_environment(args.env).make_vec
     envs = make_vec(num_envs, action_pool, K, list(stream), **task_options(args))
