@@ -105,7 +105,7 @@ TABLE = {
     "gridworld": rows("gridworld", METHODS | ENGINEERED | ONE_HOT)
     | {"ours_linear_path": "gridworld --representation {fig4/ours_linear_path}"},
     "recsys": rows("recsys", RECSYS),
-    "create-push": rows(f"{CREATE} --task push", METHODS | INPUTS | NUMBERS),
+    "create-push": rows(f"{CREATE} --task push", METHODS | INPUTS | ENGINEERED | NUMBERS),
     "create-seesaw": rows(f"{CREATE} --task seesaw", METHODS | INPUTS | ENGINEERED | NUMBERS),
     "create-obstacle": rows(f"{CREATE} --task obstacle", METHODS | INPUTS | NUMBERS),
     "stacking": rows("stacking", METHODS | ENGINEERED),
