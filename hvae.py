@@ -123,7 +123,7 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     # Observations of one action differ little: many small updates teach more than few large ones.
     # appendix: 1,024 (recorded or used?); [code] 45 to 672, by environment; [here] "paper": all.
     "batch_observations":  (4,     4,     1024),
-    # With the ELBO's divisor, 4, only 5 of 16 dimensions of c are in use; with 64 ten (exercise 12).
+    # With the ELBO's divisor, 4, only 5 of 16 dimensions of c in use; with 64, 10 (exercise 12).
     "kl_c_divisor":        (64,    64,    1024),
     # Grid World's raw cells run from 1 to 78, a move changes them by 1: the networks would first
     # have to learn to subtract. Differences show the skill from the first update.
