@@ -168,7 +168,7 @@ def check_01(order):
     seen = float(order.largest_change(agent, state, available))
     expect(0 <= seen < 1e-4, "logits that change by rounding alone", f"a change of {seen:.2g}")
 
-    def by_place(code, available):  # in the last state the first place is the best, whose ever
+    def by_place(encoding, available):  # in the last state the first place is the best, whose ever
         logits = torch.zeros(available.shape)
         logits[-1] = torch.arange(K, 0, -1)
         return logits
@@ -233,8 +233,8 @@ def check_05(ppo):
     check_same(ppo)
     update = ppo.update
 
-    def spy(agent, optimizer, batch, ent_coef):
-        numbers = [update(agent, optimizer, batch, ent_coef) for _ in range(20)]
+    def spy(agent, optimizer, batch, *rest, **more):
+        numbers = [update(agent, optimizer, batch, *rest, **more) for _ in range(20)]
         expect("outcome_loss" in numbers[0], "a number outcome_loss", [*numbers[0]])
         first, last = numbers[0]["outcome_loss"], numbers[-1]["outcome_loss"]
         expect(last < 0.8 * first, "outcome_loss to fall in 20 updates", f"{first} to {last}")
@@ -271,6 +271,7 @@ def check_06(ppo):
     expect(abs(seen - often) < 5 * often**0.5, expected, seen)
     entropy, seen = pi.entropy().mean().item(), numbers["entropy"].item()
     expect(abs(seen - entropy) < 1e-4, f"the entropy of pi, {entropy:.4f}, in the bonus", seen)
+    expect_pi_in_evaluate(ppo, agent, before)  # after a rollout as well
 
 
 def check_07(ppo):
@@ -312,7 +313,11 @@ def check_07(ppo):
 
 def check_08(ppo):
     need_change(ppo)
-    agent, _, envs, state, available = make(ppo)
+    agent, before, envs, state, available = make(ppo)
+    given_out = dict(before.named_parameters())
+    for name, weight in agent.named_parameters():
+        if name not in given_out:  # the new layer, which may have started with zeros
+            torch.nn.init.normal_(weight, 0.0, 0.3)
     expected = log_probs(agent, state, available)
     order = torch.randperm(K)
     shuffled = log_probs(agent, state, available[:, order])
@@ -385,8 +390,10 @@ def check_11(recsys):
     rng = np.random.default_rng(0)
     for policy in ("oracle", "mu-only"):
         ctr = []
+        repeats = 0
         for seed in range(40):
             ctr.append(recsys.play(env, policy, rng, seed))
+            repeats += len(env.choices) - len(set(env.choices))
             bought = set()
             for choice, click in zip(env.choices, env.clicks, strict=True):
                 again = choice in bought
@@ -394,6 +401,7 @@ def check_11(recsys):
                 if click:
                     bought.add(choice)
         expect(np.mean(ctr) > 0.5, f"a CTR above 0.5 of {policy}, which remembers", np.mean(ctr))
+        expect(repeats > 0, "what was not clicked to be recommended again", "never")
 
 
 def check_12(hvae):
@@ -404,11 +412,12 @@ def check_12(hvae):
     table = rng.normal(3.0, 0.3, (1024, 8))  # says little, around 3
     table[:, :3] = module.engineered_representations()[:, :3]  # says something
     table[split["train"], 3] *= rng.uniform(size=512)  # of training skills alone
+    table[:, 4] *= 2  # standard deviation 0.6, variance 0.36
     scores = hvae.probe(table, split["train"], held_out, "gridworld")
     if "dims_in_use" not in scores:
         raise Wrong("not begun: probe has no score dims_in_use")
-    expected = "3 dimensions in use (standard deviation above 0.5 over the held-out actions)"
-    expect(scores["dims_in_use"] == 3, expected, scores["dims_in_use"])
+    expected = "4 dimensions in use (standard deviation above 0.5 over the held-out actions)"
+    expect(scores["dims_in_use"] == 4, expected, scores["dims_in_use"])
     expect("nn_class" in scores, "the other scores as well", [*scores])
 
 

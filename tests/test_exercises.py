@@ -84,8 +84,8 @@ CHANGES = {
         ("CTR above 0.5 of oracle", {"score).argmax()": "-score).argmax()"}),
     ],
     "12": [
-        ("3 dimensions", {"mean[held_out_ids].std(0)": "mean.std(0)"}),
-        ("3 dimensions", {"mean[held_out_ids].std(0)": "abs(mean[held_out_ids]).mean(0)"}),
+        ("4 dimensions", {"mean[held_out_ids].std(0)": "mean.std(0)"}),
+        ("4 dimensions", {"mean[held_out_ids].std(0)": "mean[held_out_ids].var(0)"}),
     ],
 }
 
