@@ -78,7 +78,7 @@ class Args:
     """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
 
     env: Annotated[str, tyro.conf.Positional]  # gridworld, create, stacking, or a file: my_env.py
-    modality: str  # create: state [code] (places of tool and ball, ball's velocity), xy (B), video
+    modality: str  # create: state (default; [code]: tool, ball, velocity), xy (B's default), video
     recipe: Literal[RECIPES]  # which column of HYPERPARAMETERS gives the numbers
     hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline
     train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, on all parts
@@ -123,7 +123,7 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     # Observations of one action differ little: many small updates teach more than few large ones.
     # appendix: 1,024 (recorded or used?); [code] 45 to 672, by environment; [here] "paper": all.
     "batch_observations":  (4,     4,     1024),
-    # With the ELBO's divisor, 4, only 5 of 16 dimensions of c in use; with 64, 10 (exercise 12).
+    # With the ELBO's divisor, 4, only 5 of 16 dimensions of c are in use, with 64 10 (exercises/).
     "kl_c_divisor":        (64,    64,    1024),
     # Grid World's raw cells run from 1 to 78, a move changes them by 1: the networks would first
     # have to learn to subtract. Differences show the skill from the first update.
@@ -427,8 +427,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0: the picture, 1: its mask (see decode). An untrained picture is grey, worse than
-        # the first frame: the mask would fall to 0, nothing be learned. [here] It begins white.
+        # Channel 0: the picture, 1: its mask (see decode). An untrained, grey picture is worse than
+        # the first frame, so the mask would fall to 0. [here] Pictures begin white, as backgrounds.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 

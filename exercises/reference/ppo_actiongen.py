@@ -620,7 +620,7 @@ class Agent(nn.Module):
 
 @torch.no_grad()
 def play_step(envs, obs, agent):
-    """One action in each of N environments: the transition, the next observation, the infos."""
+    """Act once in N environments, each reset at once if it ends: transition, next obs, infos."""
     state, available = agent.to_tensors(obs)
     action, logprob, _, value = agent.act(state, available)
     # The environment wants the number of an available action, 0..K-1, and the other parts.
@@ -858,8 +858,8 @@ def train(args):
             if valid_score > best_score:
                 best_score = valid_score
                 best = dict(args=vars(args), step=step, agent=agent.state_dict())
-                # hvae.write gives what torch.save(best, file) writes its name when it is whole. So
-                # a process that is killed leaves no half file.
+                # hvae.write names the file of torch.save only when it is whole, so a process that
+                # is killed leaves no half file.
                 hvae.write(folder / "best.pt", partial(torch.save, best))
 
         # Record what happened (under torchrun: to the environments of rank 0).
@@ -974,7 +974,7 @@ def make_envs(args, phase, num_envs, stream):
     """Environments for a phase, (action_pool, K available), and their first observation."""
     # make_vec gives every environment a generator of its own, seeded by `stream`, so reset needs no
     # seed. (Training seeds them anew, with its rank, at first and after every checkpoint.) Each
-    # reset draws K ids of the pool.
+    # reset draws K ids, the no-op among them.
     action_pool, K = phase
     make_vec = hvae.load_environment(args.env).make_vec
     envs = make_vec(num_envs, action_pool, K, list(stream), **task_options(args))
@@ -1323,7 +1323,7 @@ class EvaluateArgs:
 
 
 def restrict_pool(options, module, table, pool, known):
-    """The pool (m,) of unseen ids for an analysis of A.3; `known` (n,) were trained on."""
+    """Narrow `pool` (m,) as options ask; unseen_ratio mixes in `known` (n,), trained on (A.3)."""
     far, gap = options.min_embedding_distance, options.min_angle_gap
     ratio = options.unseen_ratio
     if (far, gap, ratio) == (None, None, None):
