@@ -301,7 +301,7 @@ def engineered_representations() -> np.ndarray:
     (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are 15 degrees
     apart (over the 2,111 alone the speed would be constant).
     """
-    # [code] orders the classes anew in every run. [here] they are sorted, and without its boxes.
+    # [code] orders the classes anew in every run. [here] they are sorted; no flat squares (NO_BOX).
     one_hot = TOOL_KINDS[:, None] == np.unique(TOOL_KINDS)  # (NUM_ACTIONS, 21)
     numbers = np.array([tool[1:10] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])  # the angles
@@ -505,8 +505,8 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # Two pairs of boxes fall. One bars the marker's way to the subgoal at the right, and back below
-    # it to the target; the other the target's way down to the star. Tools have to catch both first.
+    # Two pairs of boxes fall: catch them. The right one bars the marker's way to the subgoal, then
+    # down and back left to the target; the left one bars the target's way down to the star.
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
@@ -806,8 +806,8 @@ def make_space() -> pymunk.Space:
     # begin: once per contact. pre_solve, post_solve: at every step, before and after the forces.
     # A target that stays on a goal is noted anew: `_judge` forgets the touch after each action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
-    # Of two balls once is enough: a marker's touch is never forgotten, and that of a goal ball ends
-    # the episode. With a marker it would not (and be lost): keep tasks to one or the other.
+    # Of two balls once is enough. But never give a task both a marker and a goal ball: a touch of
+    # the goal ball before the target hit would be forgotten (see `_judge`).
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
     space.on_collision(MOVING, LADDER, pre_solve=_on_carrier)
@@ -1127,8 +1127,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. A touch in an action before the hit (by a fan, in obstacle) is forgotten,
-        # unless it lasts. [code] counts it; [here] not: the hit is to bring the target there.
+        # Then the goal. In obstacle a fan can bring the target there before the hit. [code] remembers
+        # it; [here] the touch is forgotten unless it lasts: the hit is to bring the target there.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1158,7 +1158,7 @@ class CreateEnv(gym.Env):
 
     def _ended(self) -> tuple[bool, bool]:
         """(terminated, truncated) after this action."""
-        # [code] A ball that is still needed has left the screen.
+        # [code] The target, or before its hit the marker, has left the screen.
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
         # A.3 "no moving objects" [code]. Planks are in the list, but their centres rest on the
@@ -1247,8 +1247,8 @@ PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; 
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
 # The scale of the numbers for hvae.py: a first state becomes (x - centre) / half_width, differences
-# between states are divided by step. [here] step is 4 pixels: the decoder's deviation is at least
-# exp(-4 / 2) = 0.135 (see hvae.py) of it, so half a pixel is as exact as it can be.
+# between states are divided by step. [here] step is 4 pixels: hvae.py keeps the decoder's deviation
+# above exp(-2) = 0.135 steps, half a pixel.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
