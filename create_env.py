@@ -1127,8 +1127,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. In obstacle a fan can bring the target there before the hit. [code] counts it
-        # at the hit; [here] the touch is forgotten unless it lasts: the hit is to bring it there.
+        # Then the goal. In obstacle a fan can bring the target there before the hit. [code] counts
+        # it at the hit; [here] a touch is forgotten unless it lasts: the hit is to bring it there.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 

@@ -262,7 +262,7 @@ class GridWorldEnv(gym.Env):
 
         # End (A.1): goal, lava, or the limit. [here] the limit is `truncated`, gymnasium's word for
         # an end that only a clock makes; [code] does not tell the two apart, nor does
-        # ppo_actiongen.py: for it nothing comes after either. Ten skills are exactly 50 moves.
+        # ppo_actiongen.py: it bootstraps after neither. Ten skills are exactly 50 moves.
         terminated = success or entered[-1] == LAVA
         truncated = not terminated and moves >= MAX_MOVES
         self.over = terminated or truncated
@@ -310,9 +310,9 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 # ---- A.1 Action Observations: the world of the recordings ----
 # hvae.py scales recordings: a first state becomes (cell - centre) / half_width, -1..1; differences
-# between states are divided by step, so they stay in cells. [here], because the decoder cannot be
-# more certain than a standard deviation of 0.135 [code]. A move of 1 cell is 7 times as large; a
-# scaled move of 1 / 39.5 = 0.025 would be lost in it.
+# between states are divided by step, so they stay in cells [here]. A move of 1 cell is 7 times the
+# decoder's smallest standard deviation, 0.135 [code]; scaled like a first state, 1 / 39.5 = 0.025,
+# it would be lost in it.
 UNITS = dict(centre=39.5, half_width=39.5, step=1.0)
 
 

@@ -246,7 +246,7 @@ class RecSysEnv(gym.Env):
 
         # End (A.2): the user left, or the limit. [here] the limit is `truncated`, gymnasium's word
         # for an end that only a clock makes; [code] does not tell the two apart, nor does
-        # ppo_actiongen.py: for it nothing comes after either.
+        # ppo_actiongen.py: it bootstraps after neither.
         terminated = self.session == GONE
         truncated = not terminated and len(self.clicks) == MAX_RECOMMENDATIONS
         info = {}
@@ -507,7 +507,7 @@ def main(args: Args) -> None:
     print()
     print(f"CTR of reference policies, {args.part} products, {args.episodes} episodes each:")
     print("available", *(f"{policy:>17}" for policy in POLICIES))
-    # Available: 500 (Table 3); [code] has 25 in the final test of C.5, 50 in validation.
+    # Available: 500 (Table 3); [code] has 50 in every validation, 25 in the final test of C.5.
     for num_available in (25, 50, 500):
         print(f"{num_available:9}", end="")
         for policy in POLICIES:

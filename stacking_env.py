@@ -153,7 +153,7 @@ class Family:
     """
 
     name: str  # [code]
-    points: np.ndarray  # (V, 3) at scale 1, from the shape's origin, which is what gets a place
+    points: np.ndarray  # (V, 3) at scale 1, measured from the origin, the point that is placed
     scales: tuple  # the smallest, the largest, how many; all times SCALE_FACTOR
     num_angles: int = 1
     turn: float = 0  # degrees: `num_angles` equally spaced angles in [0, turn)
@@ -360,9 +360,9 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
-    # A.4: "randomly splitting the test set into half". Only exact copies, shapes of one solid and
-    # angle like the two cones, stay together as a group. The groups are dealt in random order: to
-    # validation while they fit into its half, else to the test.
+    # A.4: "randomly splitting the test set into half". Shapes of one solid and angle (the two
+    # cones, but a hat and a triangle, too) stay together. These groups are dealt in random order:
+    # to validation while they fit into its half, else to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
     for shape_id in unseen:
