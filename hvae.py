@@ -35,8 +35,8 @@ An observation is (L, F), L states of F numbers each. Of modality "onehot" it is
 and y as whole numbers 0-79, at most 39 from those of the first state and of the state before. Of
 "image" it is (S, S), of "video" (L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on
 seed *and* id: several calls are made, each may start `workers` processes.
-Marks: [code] taken from the authors' program; [here] our choice, and why. Where the three differ
-("appendix: ...; [code] ...; [here] ..."), the last is what this file does.
+Marks: "appendix", that of Generalization to New Actions in RL (ICML 2020); [code], the authors'
+program; [here], our choice, and why. Where all three stand, the last is what this file does.
 """
 
 import hashlib
@@ -140,7 +140,7 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
 EXCEPTIONS = {
     "onehot": {"updates": (2_000, 4_000, 0)},  # it takes longer to learn what 160 numbers mean
     # Before rates, counts and KL weights were changed, together, the model ignored z (how the ball
-    # was launched): its mean squared error, in units of `step` (see prepare), stayed near 6.5.
+    # was launched): the squared error, in units of `step` (see prepare), stayed near 6.5; now < 1.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
