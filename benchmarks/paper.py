@@ -242,7 +242,7 @@ def plan(args: Args) -> list[Job]:
 
 KEY = "env task method seed split split_seed recipe steps phase".split()
 COLUMNS = KEY + "score stderr episodes pool_size hours machine command".split()
-CURVE_KEY = "env task method seed recipe steps step".split()
+CURVE_KEY = "env task method seed split recipe steps step".split()
 CURVES = CURVE_KEY + "train_score valid_score episode_score".split()
 # What a test is asked, and its answer: columns of evaluations.csv.
 QUESTION = "actions num_available min_angle_gap min_embedding_distance unseen_ratio episodes"

@@ -305,7 +305,7 @@ def section(name: str, draw: bool) -> str:
             lines = [("training actions", seen[place, method], dict(color="0.5", ls="--"))]
             lines.append(("validation actions", points, dict(color=METHODS[method][1])))
             title, label, _ = names(place, method)
-            panels[f"{title}\n{textwrap.fill(label, 23)}"] = lines  # panels are narrow
+            panels["\n".join(textwrap.fill(x, 18) for x in (title, label))] = lines  # narrow
         picture = partial(draw_lines, path, panels, "million steps", 9, 1.4)
     elif name == "fig9":
         tests = group([row for row in rows if row["phase"] == "zero-shot"])
