@@ -40,7 +40,7 @@ A tool class of your own is an entry of OWN_KINDS. Its tools get the ids after a
 
     OWN_KINDS = {"Octagon": Kind("polygon", ORANGE, sides=8, turn=45, vary=SOLIDS)}
 
-Every split divides them 2:1:1 separately, so that no other tool changes its part; but
+Every split divides them about 2:1:1, separately, so that no other tool changes its part; but
 `engineered_representations` gets a column more and other standardised numbers. What a class does to
 a ball is a contact rule (`make_space`). If a rule raises, pymunk prints the exception and goes on.
 """
