@@ -6,8 +6,8 @@ twelve tasks and 2,111 tools (one, the no-op, does nothing), and 6,248 more for 
 the analyses. What a tool does is told by a probe ball that is launched at it (action observations).
 
 In five of the tasks the target rests, and a second, blue ball, the *marker*, is there to knock it.
-There the goal counts only from the *target hit* on: the target has moved more than 3.56 units from
-its start, whatever moved it (in obstacle and cannon the marker must have touched it).
+There [code] counts the goal only from the *target hit* on: the target has moved over 3.56 units
+from its start, whatever moved it (in obstacle and cannon the marker must have touched it).
 
     python create_env.py --task push                # a GIF of the best of 400 random episodes
     python create_env.py --play --tools Fan Funnel  # place tools of these classes by mouse
@@ -126,7 +126,7 @@ class Tool(NamedTuple):
     left_up: bool = False  # True: a see-saw's left end starts up, the weight sits on the right one
     force: float = 0.0  # impulse of a cannon, force of a fan
     speed: float = 0.0  # units/s, of belts and ladders
-    friction: float = 1.0  # Coulomb friction: that of the contact is the product of both objects'
+    friction: float = 1.0  # Coulomb friction; a contact has the product of both objects'
 
 
 class Kind(NamedTuple):
@@ -136,7 +136,7 @@ class Kind(NamedTuple):
     colour: str  # as people see it; the policy sees the grey that Pillow makes of it
     contact: int = PLAIN
     sides: int = 0  # of polygons
-    radius: float = 1.0  # units, of segments: half of [code]'s thickness (1, 2, 2.5), rounded down
+    radius: float = 1.0  # units, of segments: [code]'s thickness 1, 2 or 2.5, // 2: so 0, 1 or 1
     # Degrees: angles stay below it, because the shape is the same again after this turn. See-saws
     # have limits in place of angles: [code] below 60 with a weight, below 90 without.
     turn: int = 360
@@ -160,10 +160,10 @@ RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# A corner points to the angle. At 45 squares lie flat: a class of [code], boxes, that no split has.
+# A corner points to the angle. At 45 a square lies flat: [code] calls that a box; no split has any.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
-# weight on one end. Planks and ball tools have no friction: [code] forgets to set it.
+# weight on one end. What A.3 calls friction is their damping; Coulomb friction is 0 [code].
 HINGED = {"size": PLANK_LENGTHS, "max_angle": LIMITS, "damping": (1.0, 1.05, 1.1), "friction": (0,)}
 WEIGHTED = {"size": PLANK_LENGTHS, "max_angle": LIMITS, "left_up": (True, False)}
 WEIGHTED |= {"mass": (2, 6, 10, 14), "damping": (1.0,), "friction": (0,)}
@@ -186,7 +186,7 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    # Never placed in a game. Recordings need something to touch: a disc without effect, a GOAL.
+    # Never placed in a game. action_observations needs a shape to touch: NO_OP_RADIUS, a GOAL.
     "No-op": Kind("disc", GREEN, GOAL),
     # The tools in the order of their ids, which saved representations and runs rely on. Down to the
     # bucket they are those of the Default Split.
@@ -301,7 +301,7 @@ def engineered_representations() -> np.ndarray:
     (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are 15 degrees
     apart (over the 2,111 alone the speed would be constant).
     """
-    # [code] orders the classes anew in every run. [here] they are sorted; no flat squares (NO_BOX).
+    # [code] orders the classes anew in every run, and has boxes; [here] sorted, without (NO_BOX).
     one_hot = TOOL_KINDS[:, None] == np.unique(TOOL_KINDS)  # (NUM_ACTIONS, 21)
     numbers = np.array([tool[1:10] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])  # the angles
@@ -314,9 +314,9 @@ def engineered_representations() -> np.ndarray:
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
-# paper's main results come from this draw (cannons: 12 of 24 angles). Others may be harder: in
-# C(19, 7) / C(24, 12) = 1.9 % of all draws, the five from 120 to 180 degrees are all for training.
-# Then no test cannon shoots up and well to the left, where most goals are.
+# main results come from this draw (cannons: 12 of 24 angles). Others may be harder: 1.9 % of
+# all draws, C(19, 7) / C(24, 12), have all five angles from 120 to 180 degrees in training; then no
+# test cannon shoots up and well to the left, where most goals are.
 TRAINING_ANGLES = {
     ("Ramp", "Trampoline"): (45, 60, 75, 90, 105, 165),
     ("Triangle", "Bouncy Triangle"): (30, 45, 60, 105),
@@ -347,7 +347,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     | default  | 1,097 | 507   | 506   | half of the angles of each class, the published draw   |
     | random   | 1,097 | 507   | 506   | half of the angles of each class, drawn by `seed`      |
     | full     | 938   | 400   | 399   | by tool class, Table 1                                 |
-    | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; all tools are 3 degrees apart |
+    | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; the others: multiples of 3    |
 
     `seed` also draws which held-out tools are for validation, which for the test. The parts are
     disjoint. The no-op (id 0) is in none of them, because it is always available. The paper counts
@@ -415,7 +415,7 @@ def angle_gaps(action_ids: Sequence[int], train_ids: Sequence[int]) -> np.ndarra
     do not. 0 in a class without angles, infinity without a training tool. ValueError: bad ids.
     """
     # [code] compares with all classes at once and without wrapping (345 is 345 away from 0). [here]
-    # class by class, because 15 degrees of a fan are not 15 degrees of a ramp.
+    # class by class, because a ramp at 15 degrees does not tell what a fan at 15 does.
     check_ids(action_ids)
     ids = np.asarray(action_ids)  # in the order asked for
     train_ids = check_ids(train_ids)
@@ -454,8 +454,8 @@ class Task:
     # every reset: for target, goal and marker, and for the items with this name as their `shift`.
     shifts: dict[str, float | tuple[float, float]] = field(default_factory=dict)
     subgoals: tuple = ()  # places (norm), for the marker if there is one, else the target
-    walls: tuple[Item, ...] = ()  # at the edges of the screen; there is never a floor
-    marker_must_touch: bool = False  # no target hit before marker and target have touched
+    walls: tuple[Item, ...] = ()  # at the edges of the screen, never at the bottom
+    marker_must_touch: bool = False  # [code] no target hit before marker and target have touched
     target_hit_reward: float = LAMBDA_TARGET_HIT
     goal_on_either_side: bool = False  # the goal's x changes sign with probability 1/2
     max_actions: int = MAX_ACTIONS
@@ -505,8 +505,8 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # Two pairs of boxes fall: catch them. The right one bars the marker's way to the subgoal, then
-    # down and back left to the target; the left one bars the target's way down to the star.
+    # Two pairs of boxes fall: catch them. The right pair bars the marker's way to the subgoal, and
+    # from there down and back to the target, the left pair the target's way down to the star.
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
@@ -599,7 +599,7 @@ def to_units(norm):
 # contact box never turns. [here] it turns with the aim, as its picture does. This changes only
 # where it catches a ball, not where or how fast it shoots.
 BOX_SIZE = {"Cannon": (10.0, 7.3), "Fan": (6.7, 10.0)}
-MUZZLE = (5.0, 3.65)  # [code] units: balls start at (5 cos, 3.65 sin) of the aim, from the centre
+MUZZLE = (5.0, 3.65)  # [code] units, half the unturned box: a shot starts (5 cos, 3.65 sin) away
 # [code] Funnels and buckets are open between their last corner and their first. At tool angle 0 a
 # funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees, a bucket's at 135, 225, 315 and 45.
 LAST_CORNER = {"Funnel": 30, "Bucket": 45}
@@ -671,8 +671,6 @@ class SceneObject:
             shape = pymunk.Circle(body, tool.size or NO_OP_RADIUS, origin)
         elif kind.shape == "segment":
             shape = pymunk.Segment(body, *self.corners, kind.radius)
-        elif self.body:  # a loose box, the only polygon that moves
-            shape = pymunk.Poly.create_box(body, (tool.size, tool.size))
         else:
             shape = pymunk.Poly(body, self.corners)
 
@@ -806,8 +804,8 @@ def make_space() -> pymunk.Space:
     # begin: once per contact. pre_solve, post_solve: at every step, before and after the forces.
     # A target that stays on a goal is noted anew: `_judge` forgets the touch after each action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
-    # Of two balls once is enough. But never give a task both a marker and a goal ball: a touch of
-    # the goal ball before the target hit would be forgotten (see `_judge`).
+    # Two balls: as their touch begins [code]. But never give a task both a marker and a goal ball:
+    # a touch of the goal ball before the target hit would be forgotten (see `_judge`).
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
     space.on_collision(MOVING, LADDER, pre_solve=_on_carrier)
@@ -941,10 +939,10 @@ class CreateEnv(gym.Env):
     `placement` tells what came of it: "placed", "waited", "outside", "too close" or "blocked".
 
     ## Observation Space
-    `state`, Box(0, 255, (3, 84, 84), uint8): the last 3 grey pictures, newest last; after reset the
-    two older ones are black. `available`, Box(0, NUM_ACTIONS - 1, (K,), int64): the no-op and
-    K - 1 tools, drawn without replacement from the pool at every reset. A pool of only K - 1 tools
-    is available as it is, sorted.
+    `state`, Box(0, 255, (3, 84, 84), uint8): grey pictures, one at the end of each of the last 3
+    actions, newest last; after reset the two older ones are black. `available`, Box(0, NUM_ACTIONS
+    - 1, (K,), int64): the no-op and K - 1 tools, drawn without replacement from the pool at every
+    reset. A pool of only K - 1 tools is available as it is, sorted.
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a tool that is refused.
@@ -989,7 +987,7 @@ class CreateEnv(gym.Env):
         super().reset(seed=seed)
 
         # Subsampling: every episode has its own few tools of the pool. If all are to be available,
-        # nothing is drawn. (Full Split's tests: [code] draws a class first; [here] as appendix.)
+        # nothing is drawn. ([code] draws a class first in the Full Split's tests; not [here].)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
@@ -1127,8 +1125,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. In obstacle a fan can bring the target there before the hit. [code] counts
-        # it at the hit; [here] a touch is forgotten unless it lasts: the hit is to bring it there.
+        # Then the goal. A fan can bring the target there before the marker hits it. [code] pays for
+        # that touch at the hit; [here] only if it still lasts, since the hit is to bring it there.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1158,13 +1156,13 @@ class CreateEnv(gym.Env):
 
     def _ended(self) -> tuple[bool, bool]:
         """(terminated, truncated) after this action."""
-        # [code] The target, or before its hit the marker, has left the screen.
+        # appendix: three ends, below; [code], [here]: a lost ball, too (target; marker before hit).
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
         # A.3 "no moving objects" [code]. Planks are in the list, but their centres rest on the
         # pivot, so a turning plank counts as still. A see-saw's weight is not in it. A ball that is
         # not needed (the marker after the hit, the heavy ball) and falls for ever below the screen
-        # counts as moving. One in a bucket is at rest, though gravity has just sped it up by 0.07.
+        # counts as moving. One in a bucket rests, though gravity has just sped it up by 0.07.
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
             self._still += 1
@@ -1246,9 +1244,9 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# The scale of the numbers for hvae.py: a first state becomes (x - centre) / half_width, differences
-# between states are divided by step. [here] step is 4 pixels: hvae.py keeps the decoder's deviation
-# above exp(-2) = 0.135 steps, half a pixel.
+# The scale of the numbers for hvae.py: a first state becomes (x - centre) / half_width, so it stays
+# as it is; differences between states are divided by step. [here] step is 4 / 42 norm, 4 pixels:
+# hvae.py keeps the decoder's deviation above exp(-2) = 0.135 steps, which is then half a pixel.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1289,7 +1287,7 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
     tool = TOOLS[action]
     rng = np.random.default_rng([seed, action])
     places = rng.uniform(-PROBE_AREA, PROBE_AREA, (n, 2))  # norm, of the tool in each trajectory
-    trajectories = np.zeros((n, PROBE_LENGTH, 7), np.float32)  # of "state" 6; a plank's angle
+    trajectories = np.zeros((n, PROBE_LENGTH, 7), np.float32)  # 6 of "state" and a plank's angle
     missing = np.arange(n)  # trajectories that are still to be recorded
     attempt = 0
     while len(missing):
