@@ -6,8 +6,8 @@ twelve tasks and 2,111 tools (one, the no-op, does nothing), and 6,248 more for 
 the analyses. What a tool does is told by a probe ball that is launched at it (action observations).
 
 In five of the tasks the target rests, and a second, blue ball, the *marker*, is there to knock it.
-There [code] counts the goal only from the *target hit* on: the target has moved over 3.56 units
-from its start, whatever moved it (in obstacle and cannon the marker must have touched it).
+There the authors' code counts the goal only from the *target hit* on: the target has moved over
+3.56 units from its start, whatever moved it (obstacle, cannon: the marker must have touched it).
 
     python create_env.py --task push                # a GIF of the best of 400 random episodes
     python create_env.py --play --tools Fan Funnel  # place tools of these classes by mouse
@@ -136,7 +136,7 @@ class Kind(NamedTuple):
     colour: str  # as people see it; the policy sees the grey that Pillow makes of it
     contact: int = PLAIN
     sides: int = 0  # of polygons
-    radius: float = 1.0  # units, of segments: [code]'s thickness 1, 2 or 2.5, // 2: so 0, 1 or 1
+    radius: float = 1.0  # units, of segments: [code]: thickness // 2 (1, 2 or 2.5), so 0, 1 or 1
     # Degrees: angles stay below it, because the shape is the same again after this turn. See-saws
     # have limits in place of angles: [code] below 60 with a weight, below 90 without.
     turn: int = 360
@@ -186,7 +186,7 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    # Never placed in a game. action_observations needs a shape to touch: NO_OP_RADIUS, a GOAL.
+    # Never placed in a game. For the probe ball a disc of NO_OP_RADIUS; as a GOAL it does nothing.
     "No-op": Kind("disc", GREEN, GOAL),
     # The tools in the order of their ids, which saved representations and runs rely on. Down to the
     # bucket they are those of the Default Split.
@@ -314,9 +314,9 @@ def engineered_representations() -> np.ndarray:
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
-# main results come from this draw (cannons: 12 of 24 angles). Others may be harder: 1.9 % of
-# all draws, C(19, 7) / C(24, 12), have all five angles from 120 to 180 degrees in training; then no
-# test cannon shoots up and well to the left, where most goals are.
+# main results come from this draw (cannons: 12 of 24 angles). Others may be harder: 1.9 % of them
+# (C(19, 7) / C(24, 12): five angles fixed, 7 of the other 19) train on all five from 120 to 180
+# degrees; then no test cannon shoots up and well to the left, where most goals are.
 TRAINING_ANGLES = {
     ("Ramp", "Trampoline"): (45, 60, 75, 90, 105, 165),
     ("Triangle", "Bouncy Triangle"): (30, 45, 60, 105),
@@ -347,7 +347,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     | default  | 1,097 | 507   | 506   | half of the angles of each class, the published draw   |
     | random   | 1,097 | 507   | 506   | half of the angles of each class, drawn by `seed`      |
     | full     | 938   | 400   | 399   | by tool class, Table 1                                 |
-    | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; the others: multiples of 3    |
+    | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; held out: others of 3         |
 
     `seed` also draws which held-out tools are for validation, which for the test. The parts are
     disjoint. The no-op (id 0) is in none of them, because it is always available. The paper counts
@@ -505,8 +505,8 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # Two pairs of boxes fall: catch them. The right pair bars the marker's way to the subgoal, and
-    # from there down and back to the target, the left pair the target's way down to the star.
+    # Two pairs of boxes fall: catch them. The right pair would bar the marker's way, by the subgoal
+    # and then down, back to the target; the left pair the target's way, down a slope to the star.
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
@@ -517,7 +517,7 @@ TASKS = {
         subgoals=((0.7, -0.1),), walls=ROOM, marker_must_touch=True,
         target_hit_reward=2.0,  # appendix: 1; [code] 2; [here] as [code]
         max_actions=50),  # appendix: 30; [code] 50; [here] as [code], the published task
-    # The target has to get left of the wall. A see-saw's right end closes the way; load the left.
+    # The see-saw's low right end bars the gap left of the wall: lead the heavy ball to its left.
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9), goal=star(-0.8, -0.8),
         items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
@@ -702,7 +702,7 @@ class SceneObject:
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
-            # [code] Nothing hits it: it has no shape. The GearJoint turns it as the plank turns.
+            # [code] Nothing hits it: it has no shape. The GearJoint turns it with the plank, as there.
             weight = pymunk.Body(self.tool.mass, self.tool.mass)  # mass, moment of inertia [code]
             weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
@@ -987,7 +987,8 @@ class CreateEnv(gym.Env):
         super().reset(seed=seed)
 
         # Subsampling: every episode has its own few tools of the pool. If all are to be available,
-        # nothing is drawn. ([code] draws a class first in the Full Split's tests; not [here].)
+        # nothing is drawn. ([code] draws a class first in the Full Split's tests; [here] all tests
+        # draw alike.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
@@ -1125,8 +1126,8 @@ class CreateEnv(gym.Env):
             hit_now = moved_far and (self._marker.touched or not self.task.marker_must_touch)
             self._target_hit = hit_now
 
-        # Then the goal. A fan can bring the target there before the marker hits it. [code] pays for
-        # that touch at the hit; [here] only if it still lasts, since the hit is to bring it there.
+        # Then the goal. In obstacle and cannon a fan can bring the target there before the marker
+        # touches it. [code] pays for that at the hit; [here] not if it was in an earlier action.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1162,7 +1163,7 @@ class CreateEnv(gym.Env):
         # A.3 "no moving objects" [code]. Planks are in the list, but their centres rest on the
         # pivot, so a turning plank counts as still. A see-saw's weight is not in it. A ball that is
         # not needed (the marker after the hit, the heavy ball) and falls for ever below the screen
-        # counts as moving. One in a bucket rests, though gravity has just sped it up by 0.07.
+        # counts as moving. One in a bucket rests, though gravity has just added 0.07 > STILL_SPEED.
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
             self._still += 1
@@ -1244,9 +1245,9 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# The scale of the numbers for hvae.py: a first state becomes (x - centre) / half_width, so it stays
-# as it is; differences between states are divided by step. [here] step is 4 / 42 norm, 4 pixels:
-# hvae.py keeps the decoder's deviation above exp(-2) = 0.135 steps, which is then half a pixel.
+# For hvae.py: it turns a first state into (x - centre) / half_width, so leaves it as it is, and
+# divides differences between states by step. [here] step is 4 pixels, 4 / 42 norm: the decoder's
+# smallest standard deviation, exp(-2) = 0.135 steps, is half a pixel, the finest a picture shows.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
