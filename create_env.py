@@ -702,7 +702,7 @@ class SceneObject:
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
-            # [code] Nothing hits it: it has no shape. The GearJoint turns it with the plank, as there.
+            # [code] Nothing hits it: no shape. The GearJoint turns it with the plank, as there.
             weight = pymunk.Body(self.tool.mass, self.tool.mass)  # mass, moment of inertia [code]
             weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
