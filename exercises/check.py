@@ -43,7 +43,8 @@ def load(name, path):
 
 
 sys.path.insert(0, str(ROOT))
-reference = load("reference", ROOT / "exercises/reference/ppo_actiongen.py")
+REFERENCE = ROOT / "exercises/reference"
+reference = load("reference", REFERENCE / "ppo_actiongen.py")
 hvae = reference.hvae
 load_environment = hvae.load_environment  # Grid World as it was handed in
 
@@ -423,7 +424,7 @@ def check_12(hvae):
 
 def check_same(ppo):
     weights = train(ppo)
-    load("gridworld", ROOT / "gridworld.py")  # in place of the one that was handed in
+    load("gridworld", REFERENCE / "gridworld.py")  # in place of the one that was handed in
     expected = train(reference)
     others = weights.keys() ^ expected.keys()
     expect(not others, "no other layers while new options are off", others)
