@@ -1468,7 +1468,7 @@ def play(env: CreateEnv, seed: int = 0) -> None:
     env.reset(seed=seed)
 
     def show() -> None:
-        # To the left the available tools, to the right the last picture of the episode.
+        """To the left the available tools, to the right the last picture of the episode."""
         tools = [TOOLS[action] for action in env.available]
         menu.clear()
         menu.imshow(portraits(tools, columns), extent=(0, columns, columns, 0))
@@ -1479,7 +1479,7 @@ def play(env: CreateEnv, seed: int = 0) -> None:
         figure.canvas.draw_idle()
 
     def act(choice, position) -> None:
-        # One step. The end of an episode stays in view; the act after it begins the next one.
+        """One step. The end of an episode stays in view; the act after it begins the next."""
         nonlocal chosen, total
         if env._over:
             env.reset()
@@ -1490,6 +1490,7 @@ def play(env: CreateEnv, seed: int = 0) -> None:
         show()
 
     def on_click(event) -> None:
+        """Left: choose a tool. Right: place it there."""
         nonlocal chosen
         if event.inaxes is menu:
             number = int(event.ydata) * columns + int(event.xdata)
