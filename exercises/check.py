@@ -291,13 +291,13 @@ def check_07(ppo):
     train_ids = gridworld.split_actions()["train"]
     table = 3 * gridworld.engineered_representations()
     table[train_ids] /= 3
-    agent, _, envs, state, available = make(ppo, table, bilinear=True, num_available=512)
+    agent, before, envs, state, available = make(ppo, table, bilinear=True, num_available=512)
     rollout_and_update(ppo, agent, envs, num_steps=8)
     agent.utility_query.weight.data.zero_()
     for d in range(table.shape[1]):
         agent.utility_query.bias.data.zero_()[d] = 1
-        noise = log_probs(agent, state[:1], available[:1])[0] - agent.table[available[0], d]
-        ratio = (noise.std() / agent.table[train_ids, d].std()).item()
+        noise = log_probs(agent, state[:1], available[:1])[0] - before.table[available[0], d]
+        ratio = (noise.std() / before.table[train_ids, d].std()).item()
         expect(0.42 < ratio < 0.58, "noise of 0.5 standard deviations of training actions", ratio)
 
     # The position head of C.4 reads representations, too: the odds of two positions change.
@@ -358,7 +358,12 @@ def check_09(ppo):
         for choice in (0, 1):  # LLLLL, UUUUU: the agent stays where it is
             obs, _, _, truncated, _ = env.step(choice)
             expect(obs["available"][choice] == -1, "-1 for a used skill", obs["available"])
+            expect(env.observation_space.contains(obs), "-1 in the observation space", "none")
             expect(truncated == (choice == 1), "truncated when nothing is left, not before", "no")
+            if choice == 0:
+                with contextlib.suppress(ValueError):
+                    env.step(choice)
+                    raise Wrong("expected a ValueError for a used skill; seen: none")
 
 
 def check_11(recsys):
@@ -422,10 +427,26 @@ def check_12(hvae):
     expect("nn_class" in scores, "the other scores as well", [*scores])
 
 
+def random_rewards(gridworld, steps=3000):
+    """What random choices earn in Grid World; some of them reach the goal."""
+    env = gridworld.GridWorldEnv()
+    env.reset(seed=0)
+    rewards = []
+    for choice in np.random.default_rng(0).integers(env.num_available, size=steps):
+        _, reward, terminated, truncated, _ = env.step(choice)
+        rewards.append(reward)
+        if terminated or truncated:
+            env.reset()
+    return np.array(rewards)
+
+
 def check_same(ppo):
     weights = train(ppo)
-    load("gridworld", REFERENCE / "gridworld.py")  # in place of the one that was handed in
+    rewards = random_rewards(load_environment("gridworld"))
+    given_out = load("gridworld", REFERENCE / "gridworld.py")  # not the one that was handed in
     expected = train(reference)
+    change = np.abs(rewards - random_rewards(given_out)).max()
+    expect(change == 0, "the same rewards in Grid World", f"a difference of {change:.2g}")
     others = weights.keys() ^ expected.keys()
     expect(not others, "no other layers while new options are off", others)
     for name, x in expected.items():
