@@ -38,10 +38,10 @@ then what surrounds them: which actions are available, checks, the run's folder,
 Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
 A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
 f_omega(s). A step is one action of one environment. A *score* is one number per episode (success,
-click-through rate, height): its last info has it; METRIC in the environment's file is its key.
-Two marks: [code] is the authors' released program, followed where the appendix is silent (where the
-two disagree, a comment says which one is followed); [here] is a choice of this repository, with its
-reason.
+click-through rate, height), in its last step's info, under METRIC of the environment's file.
+Two marks: [code] is the authors' released program, mostly followed where the appendix is silent
+(where the two disagree, a comment says which one is followed); [here] is a choice of this
+repository, with its reason.
 """
 
 import atexit
@@ -129,7 +129,7 @@ class Args:
     num_minibatches: int = 4  # minibatches in a rollout [code]
     update_epochs: int = 4  # passes over one rollout
     learning_rate: float = 1e-3  # of Adam, at the start
-    lr_decay_steps: int | None = None  # steps until it has fallen to a tenth; None: the whole run
+    lr_decay_steps: int | None = None  # steps of its fall and ent_coef's; None: the whole run
     gamma: float = 0.99  # discount factor of later rewards
     clip_coef: float = 0.1  # clipping range of PPO's probability ratio
     vf_coef: float = 0.5  # weight of the value loss
@@ -139,11 +139,11 @@ class Args:
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
-    published_init: bool = True  # small first weights, as in [code]; off: see Agent.__init__
+    published_init: bool = True  # first weights of [code]; off: gains, stop bias: see Agent
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . (M f_omega(s) + m) in place of an MLP [here]
-    one_hot: bool = False  # integer states enter as one-hot vectors, not as numbers [here]
-    small_pictures: bool = False  # half the size, inverted, three convolutions [here]
+    one_hot: bool = False  # integer states as one-hot vectors [here]; B's: --modality onehot
+    small_pictures: bool = False  # half size, inverted; another CNN: see cnn [here]
 
     # --- evaluation ---
     eval_every: int = 409_600  # steps between two evaluations
@@ -194,7 +194,7 @@ LR_FLOOR = 0.1  # [code]: the learning rate falls to this fraction
 # for a laptop: a quarter of the published steps or fewer, and more updates for each of them.
 FAST = {
     "gridworld": dict(
-        one_hot=True,  # a cell's id is a name, not a quantity
+        one_hot=True,  # a cell's kind is a name, not a quantity
         minibatch_size=512,  # eight times as many updates per step
         num_available=20,  # favourites are often absent, so the others are tried
         eval_available=50,  # tests keep the number of Table 3
@@ -206,7 +206,7 @@ FAST = {
     "recsys": dict(
         bilinear=True,  # an MLP learns single products by heart
         hidden_size=256,  # 64 units fit the user's taste less well
-        gamma=0.0,  # a click depends on this recommendation, hardly on earlier ones
+        gamma=0.0,  # a click hardly depends on earlier ones (A.2; see recsys.py)
         minibatch_size=512,  # more updates per step
         num_available=100,  # a fifth of the cost of the utilities
         eval_available=500,  # tests keep the number of Table 3
@@ -328,7 +328,7 @@ def mlp(inputs, H):
 def cnn(frames, H, small):
     """f_omega: pictures (B, frames, 84, 84) -> (B, H). D.3.2: "5-layer convolutional network".
 
-    small: pictures (B, frames, 42, 42), three layers [here].
+    small: pictures (B, frames, 42, 42), three layers, LayerNorm [here].
     """
     # A stride of 2 halves the picture [code]: 84 -> 42 -> 21 -> 11 -> 6 -> 3 pixels a side.
     channels = [frames, 16, 16, 32, 32, 32]
@@ -389,7 +389,7 @@ class RunningMeanStd(nn.Module):
 class Agent(nn.Module):
     """The policy and the critic of D.3.2, or the policy of a baseline.
 
-    table (A, D): the representation of every action; it is never trained here. train_ids (n,): the
+    table (A, D): row i represents the action with id i; never trained here. train_ids (n,): the
     sorted ids of the actions that can be available while training.
     """
 
@@ -414,7 +414,7 @@ class Agent(nn.Module):
             self.obs_stats = RunningMeanStd(state.shape)
             width = math.prod(state.shape)
             if args.one_hot:
-                # Which ids are there? One reset tells: every grid of Grid World has all kinds.
+                # Which kinds are there? One reset tells: every grid of Grid World has all.
                 first_states = envs.reset()[0]["state"]
                 self.register_buffer("cell_ids", torch.as_tensor(first_states).unique())
                 width *= len(self.cell_ids)
@@ -483,7 +483,7 @@ class Agent(nn.Module):
         if self.is_image:  # grey levels 0..255 -> 0..1
             encoding = self.encoder(state.float() / 255)
             return encoding, self.critic(encoding).squeeze(1)
-        # With one_hot each number, the id of a cell, becomes a one-hot vector. Without it, every
+        # With one_hot each number, a cell's kind (A.1), becomes a one-hot vector. Without it, every
         # number is brought to mean 0 and standard deviation 1 [code].
         if self.args.one_hot:
             number = torch.searchsorted(self.cell_ids, state)  # ids -> 0, 1, 2, ...
@@ -532,7 +532,7 @@ class Agent(nn.Module):
         return torch.cat(logits) + self.utility_out.bias
 
     def choice_policy(self, encoding, available):
-        """What is drawn from: K logits or, in a baseline, n logits or a Gaussian."""
+        """The distribution to draw from: K or (a baseline) n logits, or a Gaussian."""
         if self.args.method == "nearest-neighbor":  # one of the n training actions
             return Categorical(logits=self.head(encoding))  # (B, n)
         if self.args.method == "continuous":  # a point in the space of representations [code]
@@ -554,9 +554,9 @@ class Agent(nn.Module):
         return difference.square().sum(2).argmin(1)
 
     def act(self, state, available, action=None):
-        """Draw an action, or judge one that was drawn: CleanRL's `get_action_and_value`.
+        """Draw an action, or take one that was drawn: CleanRL's `get_action_and_value`.
 
-        Returns action, log-probability, entropy and value, (B,) each. An action is a dictionary of
+        Returns action, and log-probability, entropy, value, (B,) each. An action is a dictionary of
         "drawn" (what came out of the distribution), "choice" (which of the K available actions that
         means), "action_id" (its id), and "position" and "stop" where the environment has them.
         """
@@ -615,7 +615,7 @@ class Agent(nn.Module):
 # 1. Train the encoder on training actions, then compute c_i for all actions (hvae.py).
 # 2. Repeat: at every reset draw K training actions; play; update by PPO with an entropy bonus;
 #    every eval_every steps, at a *checkpoint*, score on validation actions; keep the best policy.
-# Algorithm 2 is evaluate(): the kept policy with K unseen actions per episode, nothing is learned.
+# Algorithm 2 is evaluate(), its c_i from 1.: the kept policy, K unseen actions, nothing learned.
 
 
 @torch.no_grad()
@@ -706,7 +706,7 @@ def ppo_loss(agent, mb, ent_coef):
     pg_loss = -torch.min(ratio * mb["advantage"], clipped_ratio * mb["advantage"]).mean()
 
     # The critic learns the return, which is its own estimate plus the advantage. [code] also
-    # limits how far the value may move from the rollout's: by clip_coef, in units of value.
+    # limits the value's change since the rollout: to clip_coef, though it is no ratio.
     error = (value - mb["return"]).square()
     if args.clip_vloss:
         change = (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
@@ -751,9 +751,9 @@ def update(agent, optimizer, batch, ent_coef):
 
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
-    # A phase is a pair: the pool of actions, and the number K of them that is available. The policy
-    # learns in the phase "learn". "train" scores it on the same actions (the "seen" ones, maybe
-    # with another K: see action_phases), "valid" selects, "test" is played at the end.
+    # A phase is a pair: a pool of actions, and the number K of them that is available. PPO plays in
+    # "learn". In "train" nothing is trained: it scores those "seen" actions (perhaps with another
+    # K: see action_phases), "valid" selects, "test" is played at the end.
     check(args)
     phases, train_ids = action_phases(args)
     # 1. of Algorithm 1. Rank 0 makes the run's folder and, if there is no table of representations
@@ -786,8 +786,8 @@ def train(args):
     log = Log(args, folder, step, log_size) if RANK == 0 else None
 
     rollout_size = args.minibatch_size * args.num_minibatches  # steps in a rollout
-    last_step = args.total_timesteps // rollout_size * rollout_size
-    eval_steps = max(1, args.eval_every // rollout_size) * rollout_size
+    last_step = args.total_timesteps // rollout_size * rollout_size  # whole rollouts
+    eval_steps = max(1, args.eval_every // rollout_size) * rollout_size  # whole rollouts
     decay_steps = args.lr_decay_steps or args.total_timesteps
     starts_afresh = True
     # 2. of Algorithm 1. Collect, judge, learn, now and then select.
@@ -831,7 +831,7 @@ def train(args):
 
         # Learn. The statistics of the states follow afterwards: with new ones every probability
         # would change, and the ratio in ppo_loss would not start at 1. While fine-tuning they stay
-        # as they were [code]: the layers that were taken over expect just these units. (Those of
+        # as they were [code]: the layers that were taken over expect this scaling. (Those of
         # the rewards, above, start anew; whether they do in [code] is not known.)
         numbers = update(agent, optimizer, batch, ent_coef)
         if not (agent.is_image or args.one_hot or args.finetune):
@@ -849,10 +849,10 @@ def train(args):
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
-            # The same random numbers for both scores, so that only their actions differ.
+            # The same seeds for both scores: their difference depends less on luck.
             stream = (args.seed, VALIDATION, step)
             train_score = evaluate(agent, phases["train"], args.valid_episodes, stream)["score"]
-            valid_score = train_score  # C.2 has no actions but those that it adapts to
+            valid_score = train_score  # C.2 has no others: the log shows one score twice
             if not args.adapt:
                 valid_score = evaluate(agent, phases["valid"], args.valid_episodes, stream)["score"]
             if valid_score > best_score:
@@ -946,7 +946,7 @@ def episode_means(episodes):
     return np.mean(episodes, axis=0)[1:].tolist()
 
 
-# ---- which actions are available, and what is known about them ----
+# ---- which actions are available; their representations; device; checks ----
 
 # Options that an environment's make_vec (see make_envs) takes, by their names in Args.
 # (`fully_observable` is none of them: it changes the representations, see load_table.)
@@ -1032,7 +1032,7 @@ def check_number(phase, args):
 
 def load_table(args):
     """The representations (A, D); trains the encoder if its table is not there yet."""
-    if args.finetune:  # the policy goes on with the table it knows
+    if args.finetune:  # goes on with its table; --representation is ignored
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
     # Representations made by hand: an environment computes them from what it knows of its actions.
     # Grid World's hold the moves and their sum [code]; "engineered-5d": five numbers (appendix B).
@@ -1374,7 +1374,7 @@ def evaluate_run(options):
     phase = (pool, K)
     check_number(phase, args)
 
-    # The policy as it was trained, but with other actions: that is all of Algorithm 2.
+    # The policy as it was trained, other actions: Algorithm 2 (c_i: rows of the table).
     stream = (args.seed, COMMAND)
     envs, _ = make_envs(args, phase, 1, stream)  # for its spaces, which shape the networks
     agent = Agent(envs, best["agent"]["table"].numpy(), train_ids, args)
