@@ -667,10 +667,10 @@ dist.barrier(); dist.destroy_process_group()
 """
 
 
-def joint_update(rank, world):
-    """Start and end of three updates by this process's share of one made-up rollout."""
+def joint_update(rank, world, passes=2):
+    """Start and end of `passes` + 1 updates by this process's share of one made-up rollout."""
     torch.manual_seed(0)
-    agent, args = make_agent(HYBRID, num_minibatches=1, update_epochs=3, minibatch_size=24)
+    agent, args = make_agent(HYBRID, minibatch_size=24, update_epochs=passes, head_epochs=1)
     start = torch.cat([p.detach().flatten() for p in agent.parameters()])
     T, N, mine = 6, 4, slice(rank * 4 // world, (rank + 1) * 4 // world)
     state, sets = torch.randn(T * N, 7), random_sets(T * N, A=20)
@@ -690,6 +690,8 @@ def test_two_processes_learn_what_one_learns_from_the_joint_batch(tmp_path):
     run(*TORCHRUN, script)
     one, first, second = joint_update(0, 1), *(torch.load(tmp_path / rank) for rank in "01")
     assert (one[1] - one[0]).abs().max() > 1e-3  # it did learn
+    start, end, _ = joint_update(0, 1, passes=0)  # head_epochs leave the state encoder: 4,672 first
+    assert torch.equal(start[:4672], end[:4672]) and not torch.equal(start, end)
     for a, b, c in zip(one, first, second, strict=True):
         assert torch.equal(b, c)  # the same bits on both
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)

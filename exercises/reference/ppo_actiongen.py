@@ -128,6 +128,7 @@ class Args:
     minibatch_size: int = 4096  # steps in a minibatch (Table 3, "PPO batch size")
     num_minibatches: int = 4  # minibatches in a rollout [code]
     update_epochs: int = 4  # passes over one rollout
+    head_epochs: int = 0  # further passes, in which the state encoder is frozen [here]
     learning_rate: float = 1e-3  # of Adam, at the start
     lr_decay_steps: int | None = None  # steps of its fall and ent_coef's; None: the whole run
     gamma: float = 0.99  # discount factor of later rewards
@@ -732,8 +733,11 @@ def update(agent, optimizer, batch, ent_coef):
     flat["advantage"] = (flat["advantage"] - advantages.mean()) / (advantages.std() + 1e-5)
     # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
     # the first step the policy is no longer the one that played, hence the ratio in ppo_loss.
-    parameters = list(agent.parameters())
-    for _ in range(agent.args.update_epochs):
+    for epoch in range(agent.args.update_epochs + agent.args.head_epochs):
+        # The last head_epochs passes leave f_omega as it is: the utility, the position's layers and
+        # the critic learn on. Convolutions that see the same pictures often move the policy far.
+        agent.encoder.requires_grad_(epoch < agent.args.update_epochs)
+        parameters = [p for p in agent.parameters() if p.requires_grad]
         order = torch.randperm(len(flat["value"]), device=agent.table.device)
         for mb_inds in order.split(agent.args.minibatch_size // WORLD_SIZE):
             mb = {name: x.index_select(0, mb_inds) for name, x in flat.items()}
