@@ -133,8 +133,7 @@ def test_full_split_is_table_2():
 
 
 def looks(shape_id):
-    """What is the same for two congruent solids however they lie; for two that a turn about the
-    vertical or a mirror image makes one; for two that look the same."""
+    """Same for: congruent solids as they lie; made one by a turn or a mirror; of the same looks."""
     points = turned(shape_id)
     points[:, 2] -= points[:, 2].min()
     distances, heights = np.sort(pdist(points)), np.sort(points[:, 2])
