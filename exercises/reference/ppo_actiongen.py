@@ -214,8 +214,6 @@ FAST = {
         total_timesteps=10_000_000,
     ),
     "create": dict(
-        num_available=20,  # as in Grid World: other tools than the favourites are tried
-        eval_available=50,  # tests keep the number of Table 3
         small_pictures=True,  # a quarter of the cost; empty places are 0 there, not 255
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         published_init=False,  # as in Grid World
@@ -224,9 +222,9 @@ FAST = {
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
+        head_epochs=3,  # so only the layers behind the convolutions take four: they learn sooner
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
-        ent_floor=0.1,  # late in training a random tool can spoil the episode
         clip_coef=0.2,  # goals are rare, so each of them may teach more
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
         clip_vloss=False,  # a value could move by clip_coef only, too little near 10
