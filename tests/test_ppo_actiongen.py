@@ -660,10 +660,10 @@ def test_adaptation_is_to_the_whole_test_set_from_scratch_or_from_a_run(tmp_path
 
 # ---- torchrun ----
 JOINT = """import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
-import torch.distributed as dist, ppo_actiongen as ppo, test_ppo_actiongen as test
-dist.init_process_group("gloo")
+import atexit, pathlib, ppo_actiongen as ppo, test_ppo_actiongen as test; ppo.join_processes()
 test.torch.save(test.joint_update(ppo.RANK, ppo.WORLD_SIZE), {folder!r} + f"/{{ppo.RANK}}")
-dist.barrier(); dist.destroy_process_group()
+ppo.dist.barrier(); atexit._run_exitfuncs()  # no thread outlives the connection
+assert not any("gloo" in p.read_text() for p in pathlib.Path("/proc/self/task").glob("*/comm"))
 """
 
 

@@ -277,6 +277,18 @@ RANK = int(os.environ.get("RANK", 0))
 WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 
 
+def join_processes():
+    """Connect this process to the others, if there are any, until it ends."""
+    if WORLD_SIZE > 1:
+        # torch.optim imports this module, too. If it did so after the connection, the module's
+        # functions would keep threads alive that can crash Python at its end.
+        import torch.distributed.nn.functional as _  # noqa: F401
+
+        # The others may wait for hours while rank 0 trains an encoder.
+        dist.init_process_group("gloo", timeout=timedelta(days=3))
+        atexit.register(dist.destroy_process_group)
+
+
 def gather_from_all(x):
     """The objects `x` of all processes, in the order of their ranks."""
     gathered = [x] * WORLD_SIZE
@@ -1418,9 +1430,7 @@ def main(words):
         prog = "ppo_actiongen.py evaluate"
         return evaluate_run(tyro.cli(EvaluateArgs, args=words[1:], prog=prog))
     args = parse_args(words or ["--help"])
-    if WORLD_SIZE > 1:  # the others may wait for hours while rank 0 trains an encoder
-        dist.init_process_group("gloo", timeout=timedelta(days=3))
-        atexit.register(dist.destroy_process_group)
+    join_processes()
     return train(args)
 
 
