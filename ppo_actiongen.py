@@ -140,10 +140,10 @@ class Args:
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
-    published_init: bool = True  # first weights of [code]; off: gains, stop bias: see Agent
+    published_init: bool = True  # first weights of [code]; off: larger ones, see Agent.__init__
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . (M f_omega(s) + m) in place of an MLP [here]
-    one_hot: bool = False  # integer states as one-hot vectors [here]; B's: --modality onehot
+    one_hot: bool = False  # Grid World: the policy sees cells as one-hot vectors [here]
     small_pictures: bool = False  # half size, inverted; another CNN: see cnn [here]
 
     # --- evaluation ---
@@ -191,7 +191,7 @@ GAE_LAMBDA = 0.95  # [code]
 MAX_GRAD_NORM = 0.5  # [code]
 LR_FLOOR = 0.1  # [code]: the learning rate falls to this fraction
 
-# The fast recipe: every difference from Tables 3 and 4, all of them [here], with its reason. It is
+# The fast recipe: every difference from the recipe `paper`, with its reason; all are [here]. It is
 # for a laptop: a quarter of the published steps or fewer, and more updates for each of them.
 FAST = {
     "gridworld": dict(
@@ -217,12 +217,12 @@ FAST = {
         small_pictures=True,  # a quarter of the cost; empty places are 0 there, not 255
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         published_init=False,  # as in Grid World
-        lr_decay_steps=None,  # the rate falls over the run, whatever its length
+        lr_decay_steps=None,  # as D.2 says: the rate falls over the run, whatever its length
         hidden_size=256,  # which tool, and where: more to represent
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
-        head_epochs=3,  # so only the layers behind the convolutions take four: they learn sooner
+        head_epochs=3,  # so only the layers behind f_omega take four; with one they learn slowly
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
         clip_coef=0.2,  # goals are rare, so each of them may teach more
@@ -280,8 +280,8 @@ WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 def join_processes():
     """Connect this process to the others, if there are any, until it ends."""
     if WORLD_SIZE > 1:
-        # torch.optim imports this module, too. If it did so after the connection, the module's
-        # functions would keep threads alive that can crash Python at its end.
+        # To be imported before the processes are connected. torch.optim imports it as well; if it
+        # is the first and does so later, Python can crash at its end.
         import torch.distributed.nn.functional as _  # noqa: F401
 
         # The others may wait for hours while rank 0 trains an encoder.
@@ -315,7 +315,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of a stream: (run's seed, use[, step[, rank]]), as far as the caller gives them."""
+    """`n` seeds of a stream: a few integers, (run's seed, use), with or without (step, rank)."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -378,8 +378,8 @@ class RunningMeanStd(nn.Module):
     def __init__(self, shape=()):
         super().__init__()
         # Count, sum and sum of squares: from these three the statistics of all numbers follow, and
-        # they can be added up over batches and processes. They start as if 1e-4 numbers of variance
-        # 1 had been seen [code].
+        # they can be added up over batches and processes. They start as if 1e-4 numbers had been
+        # seen, of mean 0 and variance 1 [code].
         prior = [torch.full(shape, x, dtype=torch.float64) for x in (1e-4, 0.0, 1e-4)]
         self.register_buffer("sums", torch.stack(prior))  # (3, *shape)
 
@@ -413,9 +413,10 @@ class Agent(nn.Module):
         # Not saved: they follow from the options, and fine-tuning (C.2) has others.
         self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
 
-        # f_omega and the critic V. With pictures V is linear in f_omega(s), else an MLP of its own
-        # (D.3.2) reads s itself [code]. The critic does not see which actions are available: V is
-        # the value of a state for an average set of them; a good or a bad set is noise to it.
+        # f_omega and the critic V. With pictures V is one linear layer on f_omega(s); else it is an
+        # MLP of its own (D.3.2) that reads s itself [code]. The critic does not see which actions
+        # are available: V is the value of a state for an average set of them; a good or a bad set
+        # is noise to it.
         state = envs.single_observation_space["state"]
         self.is_image = len(state.shape) == 3
         if self.is_image:
@@ -484,7 +485,7 @@ class Agent(nn.Module):
     def to_tensors(self, obs):
         """An observation as tensors: states (N, ...) and ids of the available actions (N, K)."""
         state = torch.as_tensor(obs["state"])
-        if self.args.small_pictures:
+        if self.is_image and self.args.small_pictures:
             state = small_inverted(state)
         available = torch.as_tensor(obs["available"])
         return state.to(self.table.device), available.to(self.table.device)
@@ -529,21 +530,22 @@ class Agent(nn.Module):
         # actions are available in many rows of the batch, so the U different ones are mapped once.
         weight = W_c @ project.weight  # (H, H) @ (H, D) -> (H, D)
         bias = W_c @ project.bias  # (H,)
-        ids, row_of = available.unique(return_inverse=True)  # (U,), (B, K): ids[row_of] = available
+        ids, row_of = available.unique(return_inverse=True)  # (U,), (B, K); the row of each action
         action_part = F.linear(self.table[ids], weight, bias)  # (U, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
         # into the processor's cache, so b = `piece` states at a time: 800,000 numbers, 3 MB [here].
+        # (index_select gathers action_part[rows]; its gradient is faster than that of brackets.)
         piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
-        for states, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
-            actions = action_part.index_select(0, rows.flatten())  # (b * K, H)
-            hidden = states[:, None] + actions.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
+        for e_part, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
+            c_part = action_part.index_select(0, rows.flatten())  # (b * K, H)
+            hidden = e_part[:, None] + c_part.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
             logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
         return torch.cat(logits) + self.utility_out.bias
 
     def choice_policy(self, encoding, available):
-        """The distribution to draw from: K or (a baseline) n logits, or a Gaussian."""
+        """What is drawn from: K logits (utility), n (nearest-neighbor), a Gaussian (continuous)."""
         if self.args.method == "nearest-neighbor":  # one of the n training actions
             return Categorical(logits=self.head(encoding))  # (B, n)
         if self.args.method == "continuous":  # a point in the space of representations [code]
@@ -626,12 +628,16 @@ class Agent(nn.Module):
 # 1. Train the encoder on training actions, then compute c_i for all actions (hvae.py).
 # 2. Repeat: at every reset draw K training actions; play; update by PPO with an entropy bonus;
 #    every eval_every steps, at a *checkpoint*, score on validation actions; keep the best policy.
-# Algorithm 2 is evaluate(), its c_i from 1.: the kept policy, K unseen actions, nothing learned.
+# Algorithm 2 is evaluate(): the kept policy acts with K unseen actions, whose c_i step 1 has
+# computed. Nothing is learned there.
 
 
 @torch.no_grad()
 def play_step(envs, obs, agent):
-    """Act once in N environments, each reset at once if it ends: transition, next obs, infos."""
+    """Act once in N environments: the transition, the next obs, infos.
+
+    Where an episode ends, the next obs is already the first one of a new episode.
+    """
     state, available = agent.to_tensors(obs)
     action, logprob, _, value = agent.act(state, available)
     # The environment wants the number of an available action, 0..K-1, and the other parts.
@@ -644,6 +650,7 @@ def play_step(envs, obs, agent):
     # among just these. Running out of time is an end like any other [code], since the limits are
     # short and part of the task.
     transition = dict(state=state, available=available, logprob=logprob, value=value, **action)
+    # (x.to(value): with the dtype and on the device of `value`.)
     transition["reward"] = torch.as_tensor(reward).to(value)
     transition["done"] = torch.as_tensor(terminated | truncated).to(value)  # 1.0 or 0.0
     return transition, obs, infos
@@ -766,8 +773,8 @@ def update(agent, optimizer, batch, ent_coef):
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
     # A phase is a pair: a pool of actions, and the number K of them that is available. PPO plays in
-    # "learn". In "train" nothing is trained: it scores those "seen" actions (perhaps with another
-    # K: see action_phases), "valid" selects, "test" is played at the end.
+    # phases["learn"]; scores are of the parts of the split, "train", "valid" and "test" (see
+    # action_phases).
     check(args)
     phases, train_ids = action_phases(args)
     # 1. of Algorithm 1. Rank 0 makes the run's folder and, if there is no table of representations
@@ -803,16 +810,15 @@ def train(args):
     last_step = args.total_timesteps // rollout_size * rollout_size  # whole rollouts
     eval_steps = max(1, args.eval_every // rollout_size) * rollout_size  # whole rollouts
     decay_steps = args.lr_decay_steps or args.total_timesteps
-    starts_afresh = True
     # 2. of Algorithm 1. Collect, judge, learn, now and then select.
     while step < last_step:
         started = time.perf_counter()
-        if starts_afresh:
+        if step % eval_steps == 0:
             # At first and after every checkpoint, all random numbers and all episodes start anew.
             # So a run that goes on from a checkpoint equals one that was never interrupted, and
             # evaluations, which use PyTorch's generator as well, do not change the training.
-            # Episodes still running are dropped. The iteration before this one has learned from
-            # their first part, with the critic's `next_value` (below) in place of the rest.
+            # Episodes still running are cut off. The last rollout has learned from their first
+            # part; in place of the rest it took the critic's `next_value` (below).
             torch.manual_seed(seeds(1, args.seed, TORCH, step, RANK)[0])
             obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
             G = torch.zeros(N, device=device)  # see running_returns
@@ -832,7 +838,7 @@ def train(args):
 
         # Judge. Unless states are pictures, rewards are divided by the standard deviation of a
         # running return, so that values are of the order of 1, and clipped [code]. With pictures
-        # they stay, for no known reason [code]; so CREATE's fast recipe has another vf_coef.
+        # the rewards are used as they are [code]; hence the small vf_coef of CREATE's fast recipe.
         rewards = batch["reward"]
         if not agent.is_image:
             returns, G = running_returns(rewards, batch["done"], G, args.gamma)
@@ -846,7 +852,7 @@ def train(args):
         # Learn. The statistics of the states follow afterwards: with new ones every probability
         # would change, and the ratio in ppo_loss would not start at 1. While fine-tuning they stay
         # as they were [code]: the layers that were taken over expect this scaling. (Those of
-        # the rewards, above, start anew; whether they do in [code] is not known.)
+        # the rewards, above, start anew [here].)
         numbers = update(agent, optimizer, batch, ent_coef)
         if not (agent.is_image or args.one_hot or args.finetune):
             agent.obs_stats.update(batch["state"].flatten(0, 1))
@@ -872,8 +878,8 @@ def train(args):
             if valid_score > best_score:
                 best_score = valid_score
                 best = dict(args=vars(args), step=step, agent=agent.state_dict())
-                # hvae.write names the file of torch.save only when it is whole, so a process that
-                # is killed leaves no half file.
+                # hvae.write lets torch.save fill a temporary file, and renames it when it is whole:
+                # a process that is killed leaves no half file.
                 hvae.write(folder / "best.pt", partial(torch.save, best))
 
         # Record what happened (under torchrun: to the environments of rank 0).
@@ -892,7 +898,6 @@ def train(args):
                 checkpoint["args"] = vars(args)
                 checkpoint["progress"] = (step, seconds, best_score, log_size)
                 hvae.write(path, partial(torch.save, checkpoint))
-        starts_afresh = is_checkpoint
     envs.close()
     if RANK:
         return {}
@@ -1060,25 +1065,23 @@ def load_table(args):
         table = module.engineered_representations(**options)
         hvae.check_table("engineered_representations", table, module)
         return table
-    # A file that hvae.py has written. It has to be of this environment and of this split: another
-    # encoder may have seen actions that are unseen here.
-    path = Path(args.representation)
-    if path.suffix == ".npz":
-        return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
-
     # The encoder is trained on training actions only (but for "hvae-all"). Then it gives every
     # action a representation, the unseen ones, too: the mean of q(c | observations). One table
     # serves all seeds of the policy, as published: the encoder's seed stays 0.
-    encoder_args = hvae.default_args(args.env, args.hvae_recipe, args.modality)
-    changes = dict(split=args.split, split_seed=args.split_seed)
-    changes.update(runs_dir=args.runs_dir, device=args.device, **ENCODERS[args.representation])
-    encoder_args = replace(encoder_args, **changes)
-    path = hvae.representation_path(encoder_args)
-    print(f"representations: {path}", flush=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(f"{path}.lock"):  # two runs that start together train the encoder once
-        if not path.exists():
-            hvae.train(encoder_args)
+    path = Path(args.representation)  # a file that hvae.py has written, or how to make one
+    if path.suffix != ".npz":
+        encoder_args = hvae.default_args(args.env, args.hvae_recipe, args.modality)
+        changes = dict(split=args.split, split_seed=args.split_seed)
+        changes.update(runs_dir=args.runs_dir, device=args.device, **ENCODERS[args.representation])
+        encoder_args = replace(encoder_args, **changes)
+        path = hvae.representation_path(encoder_args)
+        print(f"representations: {path}", flush=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{path}.lock"):  # two runs that start together train the encoder once
+            if not path.exists():
+                hvae.train(encoder_args)
+    # The file has to be of this environment and of this split: another encoder may have seen
+    # actions that are unseen here.
     return hvae.load_representation(path, args.env, args.split, args.split_seed)["mean"]
 
 
@@ -1164,9 +1167,9 @@ def claim_folder(args):
     """
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
-    # Two processes in one folder would mix their rows. The operating system ends a lock with its
-    # process, however that ends. It would also end with the object `lock`, so atexit keeps it.
-    # (is_singleton: within one process, claiming it twice is no conflict.)
+    # Two processes in one folder would mix their rows. The operating system frees a lock when its
+    # process ends, however it ends. Python would free it with the object `lock`, at the end of this
+    # function, so atexit keeps the object. (is_singleton: one process may claim a folder twice.)
     lock = FileLock(folder / ".lock", is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -1255,7 +1258,7 @@ class Log:
 
 
 def finish(folder, agent, phases, step, seconds):
-    """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
+    """Test the best checkpoint, print the scores, write results.json, draw pictures."""
     # The last policy is forgotten; what is tested is the one that validation has selected.
     args = agent.args
     best = load(folder / "best.pt")
@@ -1263,14 +1266,12 @@ def finish(folder, agent, phases, step, seconds):
     metric = hvae.load_environment(args.env).METRIC
     results = dict(metric=metric, seed=args.seed, command=shlex.join(sys.orig_argv))
     results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
-    tested = {name: phase for name, phase in phases.items() if name in TESTED}
-    for name, phase in tested.items():
-        results[name] = evaluate(agent, phase, args.eval_episodes, (args.seed, TEST))
-    write_json(folder / "results.json", results)
-
     print(f"\n{metric}, mean and standard error of {args.eval_episodes} episodes")
-    for name in tested:
-        print("{:10} {score:7.3f} +- {stderr:.3f}".format(TESTED[name], **results[name]))
+    for name, title in TESTED.items():
+        if name in phases:  # C.2 has only "train"
+            results[name] = evaluate(agent, phases[name], args.eval_episodes, (args.seed, TEST))
+            print("{:10} {score:7.3f} +- {stderr:.3f}".format(title, **results[name]), flush=True)
+    write_json(folder / "results.json", results)
     try:  # whatever goes wrong with a picture, the results are safe
         plot_curve(folder, metric)
         record_episode(agent, phases["train" if args.adapt else "test"], folder / "episode.gif")
