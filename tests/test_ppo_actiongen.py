@@ -418,9 +418,9 @@ def test_broken_and_foreign_checkpoints_are_refused_in_one_sentence(finished, tm
         ppo.load(tmp_path / "option")
     agent, _ = make_agent(hidden_size=16)
     with pytest.raises(UserError, match="does not fit this script and its options: .*outcome"):
-        ppo.put(dict(agent=agent.state_dict() | dict(outcome=torch.ones(2))), "x", agent=agent)
+        ppo.restore(dict(agent=agent.state_dict() | dict(outcome=torch.ones(2))), "x", agent=agent)
     with pytest.raises(UserError, match="size mismatch for "):
-        ppo.put(dict(agent=make_agent()[0].state_dict()), "x", agent=agent)
+        ppo.restore(dict(agent=make_agent()[0].state_dict()), "x", agent=agent)
 
 
 def test_a_run_that_diverges_says_so(tmp_path):

@@ -130,7 +130,7 @@ class Args:
     update_epochs: int = 4  # passes over one rollout
     head_epochs: int = 0  # further passes, in which the state encoder is frozen [here]
     learning_rate: float = 1e-3  # of Adam, at the start
-    lr_decay_steps: int | None = None  # steps of its fall and ent_coef's; None: the whole run
+    lr_decay_steps: int | None = None  # steps in which it and ent_coef fall; None: the whole run
     gamma: float = 0.99  # discount factor of later rewards
     clip_coef: float = 0.1  # clipping range of PPO's probability ratio
     vf_coef: float = 0.5  # weight of the value loss
@@ -140,7 +140,7 @@ class Args:
 
     # --- networks ---
     hidden_size: int = 64  # units in every hidden layer (Table 4)
-    published_init: bool = True  # first weights of [code]; off: larger ones, see Agent.__init__
+    published_init: bool = True  # first weights of [code]; off: others, see class Agent
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . (M f_omega(s) + m) in place of an MLP [here]
     one_hot: bool = False  # Grid World: the policy sees cells as one-hot vectors [here]
@@ -222,7 +222,7 @@ FAST = {
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
-        head_epochs=3,  # so only the layers behind f_omega take four; with one they learn slowly
+        head_epochs=3,  # so only the layers after f_omega take 1 + 3: with one they learn slowly
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
         clip_coef=0.2,  # goals are rare, so each of them may teach more
@@ -280,8 +280,8 @@ WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 def join_processes():
     """Connect this process to the others, if there are any, until it ends."""
     if WORLD_SIZE > 1:
-        # To be imported before the processes are connected. torch.optim imports it as well; if it
-        # is the first and does so later, Python can crash at its end.
+        # torch.optim imports this module as well. If that is the first import, after the processes
+        # have been connected, Python can crash when it ends. So it is imported here, before.
         import torch.distributed.nn.functional as _  # noqa: F401
 
         # The others may wait for hours while rank 0 trains an encoder.
@@ -315,7 +315,7 @@ COMMAND = 5  # the command `evaluate`
 
 
 def seeds(n, *stream):
-    """`n` seeds of a stream: a few integers, (run's seed, use), with or without (step, rank)."""
+    """`n` seeds. `stream` are integers: the run's seed, the use, perhaps step and rank."""
     return np.random.SeedSequence(stream).generate_state(n).tolist()
 
 
@@ -352,8 +352,8 @@ def cnn(frames, H, small):
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
         # [code] keeps PyTorch's initial weights. They shrink the signal from layer to layer, until
-        # all pictures have nearly the same features. A run of a few million steps would lose time
-        # over it: with --small-pictures, and only there, they are larger [here].
+        # all pictures have nearly the same features, and CREATE would lose time over it. So with
+        # --small-pictures they are larger [here]. (Not tried with large pictures.)
         if small:
             layer_init(conv)
         layers += [conv, nn.ReLU()]
@@ -410,7 +410,8 @@ class Agent(nn.Module):
         H = args.hidden_size
         D = table.shape[1]
         self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
-        # Not saved: they follow from the options, and fine-tuning (C.2) has others.
+        # Not saved: they follow from the options. (A run that is fine-tuned, C.2, has other ids
+        # than the run that it starts from.)
         self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
 
         # f_omega and the critic V. With pictures V is one linear layer on f_omega(s); else it is an
@@ -469,7 +470,7 @@ class Agent(nn.Module):
                 nn.init.constant_(self.fc_stop.bias[0], 4.0)
 
     def position_head(self):
-        """The layers behind alpha, or beta, of the Beta distribution over positions."""
+        """The layers that compute alpha, or beta, of the Beta distribution over positions."""
         H = self.args.hidden_size
         dims = self.action_parts["position"].shape[0]
         if not self.args.aux_conditioned:  # D.3.2: linear, from the state's encoding; gain 1 [code]
@@ -545,7 +546,7 @@ class Agent(nn.Module):
         return torch.cat(logits) + self.utility_out.bias
 
     def choice_policy(self, encoding, available):
-        """What is drawn from: K logits (utility), n (nearest-neighbor), a Gaussian (continuous)."""
+        """The distribution to draw from, by method: over K actions, over n, or a Gaussian."""
         if self.args.method == "nearest-neighbor":  # one of the n training actions
             return Categorical(logits=self.head(encoding))  # (B, n)
         if self.args.method == "continuous":  # a point in the space of representations [code]
@@ -772,13 +773,13 @@ def update(agent, optimizer, batch, ent_coef):
 
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
-    # A phase is a pair: a pool of actions, and the number K of them that is available. PPO plays in
-    # phases["learn"]; scores are of the parts of the split, "train", "valid" and "test" (see
-    # action_phases).
+    # A phase says which actions are available: a pool of actions, and how many of it, K. PPO plays
+    # in phases["learn"]. "train" (the same pool, another K), "valid" and "test" are for scores
+    # only: see action_phases.
     check(args)
     phases, train_ids = action_phases(args)
-    # 1. of Algorithm 1. Rank 0 makes the run's folder and, if there is no table of representations
-    # yet, trains the encoder. All others wait here, and receive both.
+    # 1. of Algorithm 1: the encoder, and the table of all c_i (see load_table). Rank 0 makes both,
+    # unless they are there, and the run's folder. All other processes wait here, and receive them.
     made = (claim_folder(args), load_table(args)) if RANK == 0 else None
     folder, table = gather_from_all(made)[0]  # [0]: what rank 0 has made
 
@@ -802,7 +803,7 @@ def train(args):
     log_size = 0  # bytes of metrics.csv; what comes after the checkpoint is cut off
     if args.resume and path.exists():
         checkpoint = load(path)
-        put(checkpoint, path, **learned)
+        restore(checkpoint, path, **learned)
         step, seconds, best_score, log_size = checkpoint["progress"]
     log = Log(args, folder, step, log_size) if RANK == 0 else None
 
@@ -817,8 +818,8 @@ def train(args):
             # At first and after every checkpoint, all random numbers and all episodes start anew.
             # So a run that goes on from a checkpoint equals one that was never interrupted, and
             # evaluations, which use PyTorch's generator as well, do not change the training.
-            # Episodes still running are cut off. The last rollout has learned from their first
-            # part; in place of the rest it took the critic's `next_value` (below).
+            # Episodes still running are cut off. The last update has used their first part, and in
+            # place of the rest the critic's `next_value` (below).
             torch.manual_seed(seeds(1, args.seed, TORCH, step, RANK)[0])
             obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
             G = torch.zeros(N, device=device)  # see running_returns
@@ -836,9 +837,10 @@ def train(args):
         # has to read the representations. (--no-subsample: always the same set.)
         batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
 
-        # Judge. Unless states are pictures, rewards are divided by the standard deviation of a
-        # running return, so that values are of the order of 1, and clipped [code]. With pictures
-        # the rewards are used as they are [code]; hence the small vf_coef of CREATE's fast recipe.
+        # Judge: how much better than expected did each action turn out (gae)? Unless states are
+        # pictures, rewards are first divided by the standard deviation of a running return, so that
+        # values are of the order of 1, and clipped [code]. With pictures the rewards are used as
+        # they are [code]; hence the small vf_coef of CREATE's fast recipe.
         rewards = batch["reward"]
         if not agent.is_image:
             returns, G = running_returns(rewards, batch["done"], G, args.gamma)
@@ -849,10 +851,10 @@ def train(args):
         batch["advantage"] = gae(rewards, batch["value"], batch["done"], next_value, args.gamma)
         batch["return"] = batch["advantage"] + batch["value"]
 
-        # Learn. The statistics of the states follow afterwards: with new ones every probability
-        # would change, and the ratio in ppo_loss would not start at 1. While fine-tuning they stay
-        # as they were [code]: the layers that were taken over expect this scaling. (Those of
-        # the rewards, above, start anew [here].)
+        # Learn. The statistics of the states are renewed only afterwards [here]: with new ones
+        # every probability would change, and the ratio in ppo_loss would not start at 1. While
+        # fine-tuning they stay as they were [code]: the layers that were taken over expect this
+        # scaling. (Those of the rewards, above, start anew [here].)
         numbers = update(agent, optimizer, batch, ent_coef)
         if not (agent.is_image or args.one_hot or args.finetune):
             agent.obs_stats.update(batch["state"].flatten(0, 1))
@@ -863,9 +865,10 @@ def train(args):
         step += rollout_size
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
-        # with actions which neither encoder (but for hvae-all) nor policy was trained on. Test
-        # actions do not select: the best of many noisy scores is too high by luck, so the score
-        # that is reported has to come from actions that had no part in the choice.
+        # with actions which neither encoder (but for hvae-all) nor policy was trained on; as many
+        # of them are available as in the test. Test actions do not select: the best of many noisy
+        # scores is too high by luck, so the score that is reported has to come from actions that
+        # had no part in the choice.
         is_checkpoint = step % eval_steps == 0 or step == last_step
         train_score = valid_score = None
         if is_checkpoint and RANK == 0:
@@ -915,8 +918,8 @@ def train(args):
 def evaluate(agent, phase, episodes, stream):
     """The frozen policy with actions of a phase, (action_pool, K): means over `episodes` episodes.
 
-    Nothing is learned here; for new actions other rows of the table are read. Every episode has its
-    own K actions of the pool. Actions are drawn, as in training, not the likeliest taken [code].
+    At every reset K actions of the pool become available. Their c_i are rows of the table. Actions
+    are drawn from pi, as in training, not the likeliest taken [code]. Nothing is learned here.
     `stream` names the random numbers, see `seeds`. Returns score, its standard error over episodes
     (published error bars are over 5 seeds, 8 in Grid World, instead), return, length, episodes.
     """
@@ -1054,7 +1057,7 @@ def load_table(args):
     if args.finetune:  # goes on with its table; --representation is ignored
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
     # Representations made by hand: an environment computes them from what it knows of its actions.
-    # Grid World's hold the moves and their sum [code]; "engineered-5d": five numbers (appendix B).
+    # In Grid World: the moves and their sum [code]; with "engineered-5d" five numbers (appendix B).
     if args.representation.startswith("engineered"):
         module = hvae.load_environment(args.env)
         options = {}
@@ -1088,7 +1091,7 @@ def load_table(args):
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
     # With another split, the old policy would have been trained with some "new" actions. Options
-    # that decide the sizes of layers are not compared here: `put` names the layers that do not fit.
+    # that decide the sizes of layers are not compared: `restore` names the layers that do not fit.
     theirs = load(folder / "best.pt")
     for name in ("env", "method", "split", "split_seed"):
         there = getattr(theirs["args"], name)
@@ -1101,7 +1104,7 @@ def start_from(agent, folder):
         own = agent.state_dict()
         anew = [name for name in own if name.startswith(("head.", "fc_stop."))]
         theirs["agent"].update({name: own[name] for name in anew})
-    put(theirs, folder, agent=agent)
+    restore(theirs, folder, agent=agent)
 
 
 def choose_device(args):
@@ -1199,7 +1202,7 @@ def load(path):
     return checkpoint
 
 
-def put(checkpoint, path, **learned):
+def restore(checkpoint, path, **learned):
     """Copy a checkpoint's states into agent, optimiser, ...; UserError names what does not fit."""
     for name, part in learned.items():
         try:
@@ -1262,7 +1265,7 @@ def finish(folder, agent, phases, step, seconds):
     # The last policy is forgotten; what is tested is the one that validation has selected.
     args = agent.args
     best = load(folder / "best.pt")
-    put(best, folder, agent=agent)
+    restore(best, folder, agent=agent)
     metric = hvae.load_environment(args.env).METRIC
     results = dict(metric=metric, seed=args.seed, command=shlex.join(sys.orig_argv))
     results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
@@ -1394,7 +1397,7 @@ def evaluate_run(options):
     envs, _ = make_envs(args, phase, 1, stream)  # for its spaces, which shape the networks
     agent = Agent(envs, best["agent"]["table"].numpy(), train_ids, args)
     envs.close()
-    put(best, folder, agent=agent)
+    restore(best, folder, agent=agent)
     result = evaluate(agent, phase, options.episodes, stream)
     most = len(with_no_op(pool, args))
     print(f"{part}: {K} of {most} actions available, {options.episodes} episodes")
