@@ -40,7 +40,7 @@ A tool class of your own is an entry of OWN_KINDS. Its tools get the ids after a
 
     OWN_KINDS = {"Octagon": Kind("polygon", ORANGE, sides=8, turn=45, vary=SOLIDS)}
 
-Every split divides them about 2:1:1, separately, so that no other tool changes its part; but
+Every split divides these, too (see `split_actions`), and no other tool changes its part; but
 `engineered_representations` gets a column more and other standardised numbers. What a class does to
 a ball is a contact rule (`make_space`). If a rule raises, pymunk prints the exception and goes on.
 """
@@ -354,7 +354,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     it: once in the 2,111 of the default split and in the 762 training tools of the analyses, twice
     in the 1,739 of the Full Split (in training and held out). Default and random have no balls,
     bouncy balls, levers or belts, full has no 4- to 6-sided polygons, analysis has none of these.
-    A class of your own is in every split, half of the values of its first parameter in training.
+    A class of your own is in every split; half of its first parameter's values train (of three 2).
     """
     if split not in SPLITS:
         raise ValueError(f"unknown split {split!r}; allowed: {', '.join(SPLITS)}")
@@ -956,9 +956,8 @@ class CreateEnv(gym.Env):
     actions (obstacle, belt 50; basket 40). On the last step `info` has `success`, 0.0 or 1.0.
 
     ## Arguments
-    `action_pool` ids (default: training split), `num_available` K, `task` of TASKS;
-    `subgoal_reward=False` pays neither subgoals nor target hit (C.3). An unknown id or task, too
-    many available, or a bad action raises ValueError and changes nothing.
+    `action_pool` ids (default: training split), `num_available` K, `task` of TASKS. Without
+    `subgoal_reward` neither subgoals nor target hit pay (C.3). What does not exist: ValueError.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # four times as fast as the world
@@ -967,6 +966,8 @@ class CreateEnv(gym.Env):
                  task="push", subgoal_reward=True):  # fmt: skip
         if task not in TASKS:
             raise ValueError(f"unknown task {task!r}; allowed: {', '.join(TASKS)}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r}; allowed: rgb_array")
         # The pool holds tools alone; the no-op is available beside whatever is drawn from it.
         ids = check_ids(split_actions()["train"] if action_pool is None else action_pool)
         self.action_pool = ids[ids != NO_OP]
@@ -986,9 +987,8 @@ class CreateEnv(gym.Env):
         """Start an episode with newly drawn available tools; returns (observation, {})."""
         super().reset(seed=seed)
 
-        # Subsampling: every episode has its own few tools of the pool. If all are to be available,
-        # nothing is drawn. ([code] draws a class first in the Full Split's tests; [here] all tests
-        # draw alike.)
+        # Subsampling: every episode has its own few tools of the pool, unless all are available.
+        # ([code] draws a class first in the Full Split's tests; [here] all tests draw alike.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)

@@ -169,9 +169,11 @@ def check_01(order):
     seen = float(order.largest_change(agent, state, available))
     expect(0 <= seen < 1e-4, "logits that change by rounding alone", f"a change of {seen:.2g}")
 
-    def by_place(encoding, available):  # in the last state the first place is the best, whose ever
-        logits = torch.zeros(available.shape)
+    def by_place(encoding, shown):  # in the last state the first place is the best, whose ever
+        logits = torch.zeros(shown.shape)
         logits[-1] = torch.arange(K, 0, -1)
+        if not torch.equal(shown, available):
+            logits[-1] -= 100  # shuffled, all fall
         return logits
 
     agent.utility = by_place
@@ -183,9 +185,10 @@ def check_01(order):
 def check_02(ppo):
     need_change(ppo)
     H = 64
-    agent, before, envs, state, available = make(ppo, hidden_size=H)
-    expected = log_probs(before, state, available)
-    expect_close(log_probs(agent, state, available), expected, "the same logits as before")
+    for bilinear in (True, False):
+        agent, before, envs, state, available = make(ppo, hidden_size=H, bilinear=bilinear)
+        expected = log_probs(before, state, available)
+        expect_close(log_probs(agent, state, available), expected, "the same logits as before")
     flops = []
     many = torch.arange(N).repeat(16)  # more pairs than actions: pairs decide the cost
     for policy in (before, agent):
@@ -233,8 +236,19 @@ def check_05(ppo):
     need_option(ppo, "outcome_coef")
     check_same(ppo)
     update = ppo.update
+    rollouts = []
 
     def spy(agent, optimizer, batch, *rest, **more):
+        # The target is V_t + delta_t, and delta_t = A_t - gamma lambda (1 - done_t) A_{t+1}.
+        going_on = agent.args.gamma * reference.GAE_LAMBDA * (1 - batch["done"])
+        later = torch.cat([batch["advantage"][1:], torch.zeros(1, N)])  # (T, N)
+        target = batch["return"] - going_on * later
+        known = [x for x in batch.values() if x.shape == target.shape]
+        found = any(torch.allclose(x.float(), target, atol=1e-4) for x in known)
+        expect(found, "the target of the first output in `batch`", [*batch])
+        rollouts.append(target)
+        if len(rollouts) > 1:  # what was learned in the first one may be hard to improve
+            return update(agent, optimizer, batch, *rest, **more)
         numbers = [update(agent, optimizer, batch, *rest, **more) for _ in range(20)]
         expect("outcome_loss" in numbers[0], "a number outcome_loss", [*numbers[0]])
         first, last = numbers[0]["outcome_loss"], numbers[-1]["outcome_loss"]
@@ -255,24 +269,28 @@ def check_05(ppo):
 
 def check_06(ppo):
     need_change(ppo)
-    agent, before, envs, *_ = make(ppo)
-    expect_pi_in_evaluate(ppo, agent, before)
-    batch = rollout_and_update(ppo, agent, envs, num_steps=128)
-    with torch.no_grad():
-        code, _ = before.encode(batch["state"])
-        pi = before.choice_policy(code, batch["available"])
-        _, numbers = ppo.ppo_loss(agent, batch, 0.05)
-    mixture = 0.9 * pi.probs + 0.1 / K  # (T * N, K)
-    drawn = batch["drawn"][:, None]
-    expected = mixture.gather(1, drawn)[:, 0].log()
-    expect_close(batch["logprob"], expected, "log-probabilities of 0.9 pi + 0.1 / K in a rollout")
-    rare = pi.probs < 0.02  # drawn mostly by the uniform part
-    often, seen = (mixture * rare).sum().item(), rare.gather(1, drawn).sum().item()
-    expected = f"about {often:.0f} of {len(drawn)} draws where pi is below 0.02"
-    expect(abs(seen - often) < 5 * often**0.5, expected, seen)
-    entropy, seen = pi.entropy().mean().item(), numbers["entropy"].item()
-    expect(abs(seen - entropy) < 1e-4, f"the entropy of pi, {entropy:.4f}, in the bonus", seen)
-    expect_pi_in_evaluate(ppo, agent, before)  # after a rollout as well
+    for method in ("utility", "nearest-neighbor", "continuous"):
+        agent, before, envs, *_ = make(ppo, method=method)
+        expect_pi_in_evaluate(ppo, agent, before)
+        batch = rollout_and_update(ppo, agent, envs, num_steps=128)
+        if method == "continuous":  # nothing changes
+            continue
+        with torch.no_grad():
+            code, _ = before.encode(batch["state"])
+            pi = before.choice_policy(code, batch["available"])
+            _, numbers = ppo.ppo_loss(agent, batch, 0.05)
+        mixture = 0.9 * pi.probs + 0.1 / pi.probs.shape[1]  # (T * N, n)
+        drawn = batch["drawn"][:, None]
+        expected = mixture.gather(1, drawn)[:, 0].log()
+        what = f"log-probabilities of 0.9 pi + 0.1 / n in a rollout of {method}"
+        expect_close(batch["logprob"], expected, what)
+        rare = pi.probs < 0.02  # drawn mostly by the uniform part
+        often, seen = (mixture * rare).sum().item(), rare.gather(1, drawn).sum().item()
+        expected = f"about {often:.0f} of {len(drawn)} draws where pi is below 0.02"
+        expect(abs(seen - often) < 5 * often**0.5, expected, seen)
+        entropy, seen = pi.entropy().mean().item(), numbers["entropy"].item()
+        expect(abs(seen - entropy) < 1e-4, f"the entropy of pi, {entropy:.4f}, in the bonus", seen)
+        expect_pi_in_evaluate(ppo, agent, before)  # after a rollout as well
 
 
 def check_07(ppo):
@@ -329,6 +347,9 @@ def check_08(ppo):
     expect(change > 0.01, "odds of two actions that depend on the others", f"a change of {change}")
     twice = log_probs(agent, state, available.repeat(1, 2))[:, :K] + np.log(2)
     expect_close(twice, expected, "a mean: the same odds if every action is there twice")
+    more = log_probs(agent, state, torch.cat([available, available[:, -1:].repeat(1, K)], dim=1))
+    change = (expected[:, 0] - expected[:, 1] - more[:, 0] + more[:, 1]).abs().max().item()
+    expect(change > 0.01, "a mean: other odds if one action comes often", f"a change of {change}")
     rollout_and_update(ppo, agent, envs)
 
 
@@ -468,7 +489,8 @@ def grade(number, work):
     """Check a file, or a folder of files: "ok", or a sentence that says what is wrong."""
     work = work.resolve()
     main = FILES.get(number, "ppo_actiongen.py")
-    paths = {name: ROOT / name for name in ("gridworld.py", main)}
+    # A script that is not handed in is the one that was given out.
+    paths = {name: REFERENCE / name for name in ("gridworld.py", main)}
     try:
         if work.is_dir():
             paths.update({name: work / name for name in paths if (work / name).exists()})

@@ -224,6 +224,8 @@ def test_what_does_not_exist_is_refused(module):
         with pytest.raises(error):
             module.split_actions(seed=bad)
     create = getattr(module, ENVIRONMENTS[module.__name__][0])
+    with pytest.raises(ValueError, match="human"):
+        create(render_mode="human")
     unknown = [1, 2, module.NUM_ACTIONS]
     for pool, K in (([1, 2, 3], 5), ([1, 2, 2, 3], 2), (unknown, 2), ([1, 2, 3], 0), ([[1, 2]], 1),
                     ([1.0, 2.0], 2), ([-1, 2], 2), ([], 1)):  # fmt: skip

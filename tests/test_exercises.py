@@ -26,6 +26,7 @@ CHANGES = {
     "01": [
         ("rounding alone", {"before[:, order]": "before"}),
         ("logits go by the place", {"torch.randperm": "torch.arange"}),
+        ("logits go by the place", {".abs()": ""}),
     ],
     "02": [
         ("ok", {"project(self.table[available])": "project(self.table)[available]"}),
@@ -34,10 +35,12 @@ CHANGES = {
     "03": [("rewards 0.1, 0, 0.024", {"(1 - LAMBDA_GOAL) * moves": "0.9 * moves"})],
     "05": [
         ("no other layers", {"            if args.outcome_coef:": "            if True:"}),
+        ("target of the first output", {'args.gamma * (1 - batch["done"])': "args.gamma"}),
         ("hidden layer to learn", {"(hidden @ agent": "(hidden.detach() @ agent"}),
     ],
     "06": [
         ("log-probabilities of 0.9 pi", {"explorer.log_prob": "policy.log_prob"}),
+        ("rollout of nearest", {"EXPLORE / policy.probs": "EXPLORE / available"}),
         ("draws where pi is below", {"explorer.sample": "policy.sample"}),
         ("entropy of pi", {"policy.entropy()": "explorer.entropy()"}),
         ("the policy as it was", {"agent.eval()": "agent.train()"}),
@@ -59,7 +62,6 @@ CHANGES = {
                 "agent.noisy_table = agent.table  #": "#",
                 "action=None):": "action=None, clean=False):\n        self.clean = clean\n",
                 "self.noisy_table[": "(self.table if self.clean else self.noisy_table)[",
-                "r(self.noisy_table,": "r(self.table if self.clean else self.noisy_table,",
                 "def play_step(envs, obs, agent": "def play_step(envs, obs, agent, clean=False",
                 "act(state, available)": "act(state, available, clean=clean)",
                 " _, obs, infos = play_step(": " _, obs, infos = play_step(clean=True, ",
@@ -67,7 +69,10 @@ CHANGES = {
             },
         ),
     ],
-    "08": [("a mean", {"[available].mean(1)": "[available].sum(1)"})],
+    "08": [
+        ("the same odds", {"[available].mean(1)": "[available].sum(1)"}),
+        ("other odds", {"[available].mean(1)": "[available].amax(1)"}),
+    ],
     "09": [
         ("no -1 taken", {"distance.masked_fill(available < 0, torch.inf)": "distance"}),
         ("probability 0", {"logits.masked_fill(available < 0, -torch.inf)": "logits"}),

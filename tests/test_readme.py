@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 
 import gridworld
 import hvae
@@ -92,6 +93,18 @@ def test_costs_are_those_of_the_csv_files():
         assert {min(times), max(times)} == {int(x) for x in minutes.split(" to ")}, (env, name)
 
 
+def test_commands_of_all_rows_are_accepted():
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "results").glob("*.csv")]
+    rows = [row for text in texts for row in csv.DictReader(text.splitlines())]
+    commands = "\n".join({row.get("command", "") for row in rows})
+    for line in re.findall(r"^python ppo_actiongen\.py ([^;&\n]*)", commands, re.M):
+        if line.startswith("evaluate "):
+            tyro.cli(ppo_actiongen.EvaluateArgs, args=line.split()[1:])
+        else:
+            args = ppo_actiongen.parse_args(line.split())
+            ppo_actiongen.check(replace(args, finetune=None))
+
+
 def run(folder: Path, words: str) -> str:
     """What the policy script prints, started in this folder."""
     command = [sys.executable, ROOT / "ppo_actiongen.py", *words.split()]
@@ -104,11 +117,11 @@ def test_example_of_an_own_environment_learns_unseen_actions(tmp_path):
     for function in core.split("\n\n\n"):
         assert textwrap.indent(function, "    ") in dial.read_text(encoding="utf-8")
     words = "--representation engineered --total-timesteps 20480 --eval-episodes 300"
-    run(tmp_path, f"{dial} {words} --run-name dial")
-    folder = tmp_path / "runs/dial"
+    run(tmp_path, f"{os.path.relpath(dial, tmp_path)} {words}")
+    (folder,) = (tmp_path / "runs").iterdir()
     # by chance 0.23: 4 moves of 0.4 in 2 pi
     assert json.loads((folder / "results.json").read_text())["test"]["score"] > 0.6
-    assert (folder / "episode.gif").exists()
+    assert folder.name.startswith("dial-") and (folder / "episode.gif").exists()
     assert "success" in run(ROOT, f"evaluate {folder} --episodes 20")  # found from everywhere
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import recsys
-from recsys import BANDIT, GONE, ORGANIC, RecSysEnv
+from recsys import GONE, ORGANIC, RecSysEnv
 
 SPLIT = recsys.split_actions()
 TEST = SPLIT["test"]
@@ -31,16 +31,10 @@ def about(value, sample, errors=4):
 # ---- Eq. 2, products, split ----
 
 
-@pytest.mark.parametrize(
-    ("x", "p"),
-    [
-        *[(-10, 0.0150), (-7, 0.0183), (-4, 0.0287), (-2, 0.0483), (-1, 0.0672), (0, 0.0967)],
-        *[(1, 0.1405), (2, 0.2008), (4, 0.3562), (6, 0.5034), (8, 0.6033), (10, 0.6611)],
-        *[(-1000, 0.0130), (1000, 0.7311)],
-    ],
-)
-def test_click_probability_worked_examples(x, p):
-    assert recsys.click_probability(x) == pytest.approx(p, abs=5e-5)
+def test_click_probability_worked_examples():
+    x = np.array([-1000, -10, -4, -1, 0, 1, 4, 10, 1000])
+    p = [0.0130, 0.0150, 0.0287, 0.0672, 0.0967, 0.1405, 0.3562, 0.6611, 0.7311]
+    np.testing.assert_allclose(recsys.click_probability(x), p, rtol=0, atol=5e-5)
 
 
 def test_products_are_unit_vectors_without_a_special_direction():
@@ -77,9 +71,6 @@ def test_representations_are_c_and_with_full_observability_a_third_of_mu():
     assert c.dtype == full.dtype == np.float32
     assert np.array_equal(full[:, :16], c)
     np.testing.assert_allclose(full[:, 16] * 3, recsys.POPULARITY, rtol=1e-6)
-    assert recsys.MODALITIES == ()  # nobody observes products
-    with pytest.raises(ValueError, match="no action observations; use engineered"):
-        recsys.action_observations(TEST, 4, "state")
 
 
 # ---- the user model ----
@@ -133,23 +124,6 @@ def test_the_environment_equals_the_plain_rules_draw_by_draw(seed, data):
     assert rewards == clicks and (terminated, truncated) == (left, not left)
     assert info == {"ctr": sum(clicks) / len(clicks)}
     assert len({o["available"].tobytes() for o in observations}) == 1
-
-
-def test_transition_frequencies_and_perturbation_of_a_draw():
-    env, n = RecSysEnv(SMALL, 5), 20_000
-    env.reset(seed=0)
-    for session in (ORGANIC, BANDIT, GONE):
-        counts, squares = np.zeros(3), np.zeros(n)
-        for i in range(n):
-            env.session, env.user = session, np.zeros(16)
-            env._transition()
-            counts[env.session] += 1
-            squares[i] = np.mean(env.user**2)
-        expected = recsys.TRANSITIONS[session]
-        assert np.all(np.abs(counts / n - expected) <= 4 * np.sqrt(expected * (1 - expected) / n))
-        # 0.01 sigma_2^2 n^2: mean 0.01. One sigma_2 for 16 dimensions: the spread is wide.
-        assert squares.mean() == about(0.01, squares)
-        assert squares.std() == pytest.approx(0.01 * np.sqrt(3 * (1 + 2 / 16) - 1), rel=0.1)
 
 
 def test_a_draw_of_exactly_zero_never_reaches_an_impossible_session():
@@ -219,8 +193,6 @@ def test_available_products_are_uniform_sorted_and_new_in_every_episode():
     assert counts[:30].sum() == 0 and counts.sum() == 20_000
     spread = np.sqrt(4000 * 0.25 * 0.75)  # binomial: a product is available in a quarter of them
     assert np.abs(counts[30:] - 1000).max() < 4 * spread
-    whole = RecSysEnv(SMALL[::-1], len(SMALL))
-    assert all(np.array_equal(whole.reset(seed=s)[0]["available"], SMALL) for s in range(3))
 
 
 def test_bad_input_is_one_value_error():
@@ -229,12 +201,6 @@ def test_bad_input_is_one_value_error():
     for action in (-1, 5, np.int64(7), 1.5, None):
         with pytest.raises(ValueError, match=r"action is .*; there are 0\.\.4"):
             env.step(action)
-    with pytest.raises(ValueError, match="human"):
-        RecSysEnv(SMALL, 5, render_mode="human")
-    with pytest.raises(ValueError, match="5000 available actions out of a pool of 2500"):
-        recsys.make_vec(2, TEST, 5000)
-    with pytest.raises(TypeError, match="fully_observable"):  # it concerns the policy's table only
-        recsys.make_vec(2, TEST, 500, 0, fully_observable=True)
 
 
 # ---- floors and ceilings ----

@@ -247,7 +247,7 @@ def test_episodes_leave_nothing_behind_and_one_seed_builds_one_tower_bit_for_bit
 
 
 @example(4600, [(0, 0.0)])  # thin, hits the table at 3.5 m/s and is met .05 inside it, slow already
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31), st.lists(st.tuples(st.integers(0, 19), st.floats(-1, 1, width=32)),
                                        min_size=1, max_size=10))  # fmt: skip
 def test_any_play_keeps_a_finite_scene_on_the_table(seed, moves):
