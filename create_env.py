@@ -957,7 +957,7 @@ class CreateEnv(gym.Env):
 
     ## Arguments
     `action_pool` ids (default: training split), `num_available` K, `task` of TASKS. Without
-    `subgoal_reward` neither subgoals nor target hit pay (C.3). What does not exist: ValueError.
+    `subgoal_reward` subgoals and target hit pay 0 (C.3). Bad values: ValueError, nothing changes.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # four times as fast as the world

@@ -101,8 +101,8 @@ def test_commands_of_all_rows_are_accepted():
         if line.startswith("evaluate "):
             tyro.cli(ppo_actiongen.EvaluateArgs, args=line.split()[1:])
         else:
-            args = ppo_actiongen.parse_args(line.split())
-            ppo_actiongen.check(replace(args, finetune=None))
+            ppo_actiongen.check(replace(ppo_actiongen.parse_args(line.split()), finetune=None))
+    assert commands.count("python ppo_actiongen.py ") > 200
 
 
 def run(folder: Path, words: str) -> str:

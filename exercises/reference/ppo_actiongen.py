@@ -353,7 +353,7 @@ def cnn(frames, H, small):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
         # [code] keeps PyTorch's initial weights. They shrink the signal from layer to layer, until
         # all pictures have nearly the same features, and CREATE would lose time over it. So with
-        # --small-pictures they are larger [here]. (Not tried with large pictures.)
+        # --small-pictures, and only there, they are larger [here].
         if small:
             layer_init(conv)
         layers += [conv, nn.ReLU()]
@@ -536,7 +536,7 @@ class Agent(nn.Module):
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
         # into the processor's cache, so b = `piece` states at a time: 800,000 numbers, 3 MB [here].
-        # (index_select gathers action_part[rows]; its gradient is faster than that of brackets.)
+        # (index_select gathers action_part[rows]: the same bits, faster here than brackets.)
         piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
         for e_part, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
@@ -774,8 +774,8 @@ def update(agent, optimizer, batch, ent_coef):
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
     # A phase says which actions are available: a pool of actions, and how many of it, K. PPO plays
-    # in phases["learn"]. "train" (the same pool, another K), "valid" and "test" are for scores
-    # only: see action_phases.
+    # in phases["learn"]. "train" (the same pool), "valid" and "test" are for scores only: see
+    # action_phases.
     check(args)
     phases, train_ids = action_phases(args)
     # 1. of Algorithm 1: the encoder, and the table of all c_i (see load_table). Rank 0 makes both,
@@ -1261,7 +1261,7 @@ class Log:
 
 
 def finish(folder, agent, phases, step, seconds):
-    """Test the best checkpoint, print the scores, write results.json, draw pictures."""
+    """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
     # The last policy is forgotten; what is tested is the one that validation has selected.
     args = agent.args
     best = load(folder / "best.pt")
@@ -1269,12 +1269,15 @@ def finish(folder, agent, phases, step, seconds):
     metric = hvae.load_environment(args.env).METRIC
     results = dict(metric=metric, seed=args.seed, command=shlex.join(sys.orig_argv))
     results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
-    print(f"\n{metric}, mean and standard error of {args.eval_episodes} episodes")
-    for name, title in TESTED.items():
+    for name in TESTED:
         if name in phases:  # C.2 has only "train"
             results[name] = evaluate(agent, phases[name], args.eval_episodes, (args.seed, TEST))
-            print("{:10} {score:7.3f} +- {stderr:.3f}".format(title, **results[name]), flush=True)
-    write_json(folder / "results.json", results)
+    write_json(folder / "results.json", results)  # first, in case the screen is gone
+
+    print(f"\n{metric}, mean and standard error of {args.eval_episodes} episodes")
+    for name, title in TESTED.items():
+        if name in results:
+            print("{:10} {score:7.3f} +- {stderr:.3f}".format(title, **results[name]))
     try:  # whatever goes wrong with a picture, the results are safe
         plot_curve(folder, metric)
         record_episode(agent, phases["train" if args.adapt else "test"], folder / "episode.gif")
