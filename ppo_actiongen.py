@@ -22,8 +22,8 @@ as unseen actions get less like the known ones?): `create --split analysis --rep
 hvae-all`, then `evaluate RUN --min-angle-gap 5` and its other options.
 
     python ppo_actiongen.py gridworld --quick         # minutes; or: recsys, create, stacking
-    python ppo_actiongen.py gridworld --recipe paper  # Tables 3, 4: the policy; for the encoder,
-                                                      # too, add --hvae-recipe paper
+    python ppo_actiongen.py gridworld --recipe paper  # the policy of Tables 3 and 4 (the encoder,
+                                                      # too: --hvae-recipe paper)
     python ppo_actiongen.py gridworld --method nearest-neighbor
     python ppo_actiongen.py gridworld --finetune runs/gridworld-s0     # C.2
     python ppo_actiongen.py my_env.py                 # an environment of your own: see README.md
@@ -35,10 +35,14 @@ of episodes and the observation, which the environments fix); torchrun; random n
 then what surrounds them: which actions are available, checks, the run's folder, the command
 `evaluate` (A.3), the command line.
 
+An environment is a module (the smallest: exercises/dial.py). It shows a dictionary: the "state",
+and "available", the ids of the K actions to choose from. A step is one action of one environment. A
+*score* is one number per episode (success, click-through rate, height), in its last step's info,
+under METRIC of the module. "The encoder" is hvae.py's; f_omega(s), the *encoding* of s, is that of
+`agent.encoder`.
+
 Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
-A all actions, D numbers in a representation, H hidden units. The *encoding* of a state is
-f_omega(s). A step is one action of one environment. A *score* is one number per episode (success,
-click-through rate, height), in its last step's info, under METRIC of the environment's file.
+n training, A all actions, D numbers in a representation, H hidden units.
 Two marks: [code] is the authors' released program, mostly followed where the appendix is silent
 (where the two disagree, a comment says which one is followed); [here] is a choice of this
 repository, with its reason.
@@ -93,7 +97,7 @@ class Args:
 
     # --- experiment ---
     env: Annotated[str, tyro.conf.Positional] = "gridworld"  # or recsys, create, stacking, FILE.py
-    recipe: Literal["fast", "paper"] = "fast"  # of the policy: FAST below, or Tables 3 and 4
+    recipe: Literal["fast", "paper"] = "fast"  # of the policy; fast: with FAST, below
     quick: bool = False  # the same protocol in minutes, with fewer steps
     method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # or a baseline
     seed: int = 0  # one seed is one run, bit for bit, on one kind of CPU
@@ -118,7 +122,7 @@ class Args:
     num_available: int = 50  # K while training (Table 3 "actions per episode")
     eval_available: int | None = None  # K in evaluations; None: num_available
     subsample: bool = True  # a random subset per episode; off: all training actions, always
-    fixed_set_size: int | None = None  # --no-subsample or --adapt: not all, but this many
+    fixed_set_size: int | None = None  # size of the set with --no-subsample, --adapt; None: all
 
     # --- PPO (Table 4 unless it says otherwise) ---
     # Table 3's "PPO batch size" is the size of a minibatch [code]. So CleanRL's num_steps is
@@ -130,7 +134,7 @@ class Args:
     update_epochs: int = 4  # passes over one rollout
     head_epochs: int = 0  # further passes, in which the state encoder is frozen [here]
     learning_rate: float = 1e-3  # of Adam, at the start
-    lr_decay_steps: int | None = None  # steps in which it and ent_coef fall; None: the whole run
+    lr_decay_steps: int | None = None  # steps in which the rate and ent_coef fall; None: all
     gamma: float = 0.99  # discount factor of later rewards
     clip_coef: float = 0.1  # clipping range of PPO's probability ratio
     vf_coef: float = 0.5  # weight of the value loss
@@ -168,13 +172,13 @@ TABLE_3 = {
     "num_available": (50, 500, 50, 20),
     "total_timesteps": (40_000_000, 40_000_000, 60_000_000, 3_000_000),
     "minibatch_size": (4096, 2048, 3072, 1024),
-    # What else is not the same in all of them (A.2, B, C.6, [code]).
+    # What else differs between the environments (A.2, B, C.6, [code]).
     "representation": ("hvae", "engineered", "hvae", "hvae"),  # A.2: recsys provides them
     "task": (None, None, "push", None),
     "placement": (None, None, None, "1d"),
     # D.2: the rate falls linearly over the training. In CREATE and Stacking over 100M steps [code],
-    # more than they train: at the end it is still .46 and .97 of its start. We follow [code], since
-    # the published scores were made with it.
+    # more than they train: with LR_FLOOR (below) it ends at .46 and .97 of its start. We follow
+    # [code], since the published scores were made with it.
     "lr_decay_steps": (None, None, 100_000_000, 100_000_000),
     "fixed_set_size": (None, 2000, None, None),  # [code]: all 5,000 products cost too much
     "eval_every": (409_600, 163_840, 614_400, 102_400),  # [code]: 25, 20, 50, 25 rollouts
@@ -196,7 +200,7 @@ LR_FLOOR = 0.1  # [code]: the learning rate falls to this fraction
 FAST = {
     "gridworld": dict(
         one_hot=True,  # a cell's kind is a name, not a quantity
-        minibatch_size=512,  # eight times as many updates per step
+        minibatch_size=512,  # eight times as many updates per step: T = 64
         num_available=20,  # favourites are often absent, so the others are tried
         eval_available=50,  # tests keep the number of Table 3
         ent_floor=0.1,  # late in training a random skill mostly ends in the lava
@@ -207,8 +211,8 @@ FAST = {
     "recsys": dict(
         bilinear=True,  # an MLP learns single products by heart
         hidden_size=256,  # 64 units fit the user's taste less well
-        gamma=0.0,  # a click hardly depends on earlier ones (A.2; see recsys.py)
-        minibatch_size=512,  # more updates per step
+        gamma=0.0,  # a click changes little of what comes after it: see recsys.py
+        minibatch_size=512,  # more updates per step: T = 64
         num_available=100,  # a fifth of the cost of the utilities
         eval_available=500,  # tests keep the number of Table 3
         total_timesteps=10_000_000,
@@ -222,12 +226,12 @@ FAST = {
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
-        head_epochs=3,  # so only the layers after f_omega take 1 + 3: with one they learn slowly
+        head_epochs=3,  # three more without f_omega: one is too few for the layers after it
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
         clip_coef=0.2,  # goals are rare, so each of them may teach more
         vf_coef=0.02,  # a goal is worth 10: at 0.5 the convolutions would serve the critic alone
-        clip_vloss=False,  # a value could move by clip_coef only, too little near 10
+        clip_vloss=False,  # a rollout could move values by clip_coef only: too little near 10
         total_timesteps=4_000_000,
         eval_every=102_400,  # 40 evaluations
     ),
@@ -352,7 +356,7 @@ def cnn(frames, H, small):
     for before, after in pairwise(channels):
         conv = nn.Conv2d(before, after, 3, stride=2, padding=1)
         # [code] keeps PyTorch's initial weights. They shrink the signal from layer to layer, until
-        # all pictures have nearly the same features, and CREATE would lose time over it. So with
+        # all pictures have nearly the same features, and CREATE learns late. So with
         # --small-pictures, and only there, they are larger [here].
         if small:
             layer_init(conv)
@@ -410,8 +414,8 @@ class Agent(nn.Module):
         H = args.hidden_size
         D = table.shape[1]
         self.register_buffer("table", torch.tensor(table, dtype=torch.float32))  # (A, D)
-        # Not saved: they follow from the options. (A run that is fine-tuned, C.2, has other ids
-        # than the run that it starts from.)
+        # Not saved: they follow from the options. (A run with --finetune, C.2, has other
+        # ids than the run that it starts from.)
         self.register_buffer("train_ids", torch.tensor(train_ids), persistent=False)  # (n,)
 
         # f_omega and the critic V. With pictures V is one linear layer on f_omega(s); else it is an
@@ -450,7 +454,7 @@ class Agent(nn.Module):
         if has_mlp:
             self.utility_hidden = layer_init(nn.Linear(2 * H, H), hidden_gain)
             self.utility_out = layer_init(nn.Linear(H, 1), 0.01)
-        elif args.method == "utility":
+        elif args.method == "utility":  # bilinear
             self.utility_query = layer_init(nn.Linear(H, D), 0.01)
         elif args.method == "nearest-neighbor":  # a logit for each training action
             self.head = layer_init(nn.Linear(H, len(train_ids)), 0.01)
@@ -531,12 +535,12 @@ class Agent(nn.Module):
         # actions are available in many rows of the batch, so the U different ones are mapped once.
         weight = W_c @ project.weight  # (H, H) @ (H, D) -> (H, D)
         bias = W_c @ project.bias  # (H,)
-        ids, row_of = available.unique(return_inverse=True)  # (U,), (B, K); the row of each action
+        ids, row_of = available.unique(return_inverse=True)  # (U,), (B, K): where in ids
         action_part = F.linear(self.table[ids], weight, bias)  # (U, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
         # into the processor's cache, so b = `piece` states at a time: 800,000 numbers, 3 MB [here].
-        # (index_select gathers action_part[rows]: the same bits, faster here than brackets.)
+        # (index_select(0, rows) is a faster action_part[rows].)
         piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
         for e_part, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
@@ -559,9 +563,9 @@ class Agent(nn.Module):
         if self.args.method == "utility":
             return drawn
         # A baseline takes the available action nearest to the training action, or to the point,
-        # that was drawn. The loss needs only the probability of what was drawn: this look-up is
-        # outside the policy, as if the environment did it. (While nearest-neighbor is trained, all
-        # training actions are available, so it gets what it drew.)
+        # that was drawn. The loss takes the probability of what was drawn; the look-up is as if the
+        # environment did it (only the position of C.4 depends on it). While nearest-neighbor is
+        # trained, all training actions are available, so it gets what it drew.
         if self.args.method == "nearest-neighbor":
             drawn = self.table[self.train_ids[drawn]]  # (B,) -> (B, D)
         difference = self.table[available] - drawn[:, None]  # (B, K, D) - (B, 1, D)
@@ -609,7 +613,8 @@ class Agent(nn.Module):
             place = Beta(1 + F.softplus(self.fc_alpha(x)), 1 + F.softplus(self.fc_beta(x)))
             if is_new:
                 action["position"] = 2 * place.sample() - 1  # (B, dims), from [0, 1] to [-1, 1]
-            # float32 may round to the border, where the log-density is minus infinity.
+            # float32 may round to the border, where the log-density is minus infinity. (It is the
+            # density on [0, 1]; that on [-1, 1] is half of it, and in a ratio the half cancels.)
             unit = (0.5 + action["position"] / 2).clamp(1e-6, 1 - 1e-6)
             logprob = logprob + place.log_prob(unit).sum(1)
             entropy = entropy + AUX_ENT_SCALE * place.entropy().sum(1)
@@ -695,13 +700,13 @@ def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
 
 
 def running_returns(rewards, dones, G, gamma):
-    """Discounted sums of the rewards up to now; only their spread is used.
+    """Discounted sums of the rewards up to now. `train` divides the rewards by their spread.
 
     G <- gamma G + r at every step, 0 after an episode. Returns all G (T, N), and the last (N,).
     """
     # Why not the true returns, which look ahead? An episode's end may be still to come. All that is
-    # needed is a rough size of the returns, and sums up to now have it [code] (so does gymnasium's
-    # NormalizeReward).
+    # needed is a rough size of the returns, and sums up to now have it [code]. (Gymnasium's
+    # NormalizeReward uses them, too.)
     returns = torch.empty_like(rewards)
     for t in range(len(rewards)):
         G = gamma * G + rewards[t]
@@ -725,14 +730,15 @@ def ppo_loss(agent, mb, ent_coef):
     pg_loss = -torch.min(ratio * mb["advantage"], clipped_ratio * mb["advantage"]).mean()
 
     # The critic learns the return, which is its own estimate plus the advantage. [code] also
-    # limits the value's change since the rollout: to clip_coef, though it is no ratio.
+    # limits the value's change since the rollout, by clip_coef, which is made for ratios.
     error = (value - mb["return"]).square()
     if args.clip_vloss:
         change = (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
         error = torch.max(error, (mb["value"] + change - mb["return"]).square())
     v_loss = 0.5 * error.mean()
 
-    # The regulariser *entropy bonus*: it keeps more than one available action likely.
+    # The regulariser *entropy bonus*: more than one available action stays likely, so f_nu learns
+    # what many c_i mean, not only those of a few favourites.
     entropy = entropy.mean()
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
 
@@ -752,8 +758,8 @@ def update(agent, optimizer, batch, ent_coef):
     # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
     # the first step the policy is no longer the one that played, hence the ratio in ppo_loss.
     for epoch in range(agent.args.update_epochs + agent.args.head_epochs):
-        # The last head_epochs passes leave f_omega as it is: the utility, the position's layers and
-        # the critic learn on. Convolutions that see the same pictures often move the policy far.
+        # The last head_epochs passes leave f_omega as it is (no gradient, so Adam skips it): the
+        # utility, the position's layers and the critic learn on. The reason stands in FAST.
         agent.encoder.requires_grad_(epoch < agent.args.update_epochs)
         parameters = [p for p in agent.parameters() if p.requires_grad]
         order = torch.randperm(len(flat["value"]), device=agent.table.device)
@@ -774,12 +780,12 @@ def update(agent, optimizer, batch, ent_coef):
 def train(args):
     """Algorithm 1, then the test; returns what results.json holds."""
     # A phase says which actions are available: a pool of actions, and how many of it, K. PPO plays
-    # in phases["learn"]. "train" (the same pool), "valid" and "test" are for scores only: see
-    # action_phases.
+    # in phases["learn"]. The others are for scores only: "train" is the same pool, mostly with the
+    # K of a test; "valid" and "test" have pools of their own (see action_phases).
     check(args)
     phases, train_ids = action_phases(args)
-    # 1. of Algorithm 1: the encoder, and the table of all c_i (see load_table). Rank 0 makes both,
-    # unless they are there, and the run's folder. All other processes wait here, and receive them.
+    # 1. of Algorithm 1: the table of all c_i, made by the encoder. Rank 0 claims the run's folder,
+    # and loads the table or trains the encoder (load_table). The other processes wait for both.
     made = (claim_folder(args), load_table(args)) if RANK == 0 else None
     folder, table = gather_from_all(made)[0]  # [0]: what rank 0 has made
 
@@ -800,7 +806,7 @@ def train(args):
     step = 0
     seconds = 0.0
     best_score = -math.inf
-    log_size = 0  # bytes of metrics.csv; what comes after the checkpoint is cut off
+    log_size = 0  # bytes of metrics.csv at the checkpoint; `Log` cuts off the rest
     if args.resume and path.exists():
         checkpoint = load(path)
         restore(checkpoint, path, **learned)
@@ -815,7 +821,7 @@ def train(args):
     while step < last_step:
         started = time.perf_counter()
         if step % eval_steps == 0:
-            # At first and after every checkpoint, all random numbers and all episodes start anew.
+            # At first and after every checkpoint all random numbers and episodes start anew [here].
             # So a run that goes on from a checkpoint equals one that was never interrupted, and
             # evaluations, which use PyTorch's generator as well, do not change the training.
             # Episodes still running are cut off. The last update has used their first part, and in
@@ -831,20 +837,20 @@ def train(args):
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * left)
         optimizer.param_groups[0]["lr"] = learning_rate
 
-        # Collect. The regulariser *subsampling* works here: at every reset each environment draws
-        # its own K available actions out of the training actions (make_envs told it the pool and K)
-        # and shows their ids in obs["available"]. The policy cannot count on any one action, so it
-        # has to read the representations. (--no-subsample: always the same set.)
+        # Collect. The regulariser *subsampling* works inside of envs.step: when an episode ends,
+        # its environment is reset, and `reset` (in the environment's file) draws K new actions out
+        # of the pool and shows their ids in obs["available"]. No action is sure to be there: the
+        # policy has to read representations. (--no-subsample: always the same set.)
         batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
 
         # Judge: how much better than expected did each action turn out (gae)? Unless states are
-        # pictures, rewards are first divided by the standard deviation of a running return, so that
-        # values are of the order of 1, and clipped [code]. With pictures the rewards are used as
+        # pictures, rewards are first divided by the standard deviation of running_returns, then
+        # clipped [code]; so values are of the order of 1. With pictures the rewards are used as
         # they are [code]; hence the small vf_coef of CREATE's fast recipe.
         rewards = batch["reward"]
         if not agent.is_image:
-            returns, G = running_returns(rewards, batch["done"], G, args.gamma)
-            reward_stats.update(returns.flatten())
+            running, G = running_returns(rewards, batch["done"], G, args.gamma)
+            reward_stats.update(running.flatten())
             rewards = (rewards / reward_stats.mean_std()[1]).clamp(-10, 10)
         with torch.no_grad():
             _, next_value = agent.encode(agent.to_tensors(obs)[0])  # (N,)
@@ -892,7 +898,7 @@ def train(args):
         row = dict(step=step, seconds=seconds, sps=rollout_size / lasted)
         row.update(train_score=train_score, valid_score=valid_score, learning_rate=learning_rate)
         row.update(episode_score=score, episode_return=total, episode_length=length, **numbers)
-        # CleanRL's 1 - var(return - value) / var(return): their difference is the advantage.
+        # CleanRL's 1 - var(return - value) / var(return): return - value is the advantage.
         row["explained_variance"] = float(1 - batch["advantage"].var() / batch["return"].var())
         if RANK == 0:
             log_size = log.write(row)
@@ -1018,17 +1024,19 @@ def action_phases(args):
         raise UserError(f"parts of split {args.split!r} overlap: unseen actions would be seen")
 
     # "learn": the policy is trained; "train": it is scored on the same actions; "valid": selects
-    # the checkpoint; "test": scored once, at the end. K random actions of the pool are available in
-    # an episode: num_available in "learn" (fast Grid World: 20), eval_available elsewhere (50). In
-    # C.2 (adapt) there are only "learn" and "train"; their pool is what all other runs call "test".
+    # the checkpoint; "test": scored once, at the end. K random actions of the pool (CREATE: K - 1
+    # and the no-op) are available in an episode: num_available in "learn" (fast Grid World: 20),
+    # eval_available elsewhere (50). In C.2 (adapt) there are only "learn" and "train"; their pool
+    # is what all other runs call "test".
     action_pool = split["test"] if args.adapt else split["train"]
     learn_K = args.num_available
     eval_K = args.eval_available or learn_K
     train_K = eval_K
-    # Three cases learn with a fixed set instead, and "train" scores them on it: nearest neighbour,
-    # the ablation without subsampling, and C.2. All of the set is available all the time. Where the
-    # utility of every action would cost too much, fixed_set_size makes it smaller [code].
-    # Nearest neighbour keeps all of it, since its outputs are cheap.
+    # Three cases learn with a fixed set instead, all of it available all the time, and "train"
+    # scores them on it: nearest neighbour, the ablation without subsampling, and C.2 [code] (the
+    # zero-shot score beside it: evaluate RUN, with all test actions as --num-available). Where the
+    # utilities would cost too much, fixed_set_size makes the set smaller [code]; nearest neighbour,
+    # whose outputs are cheap, keeps all of it.
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
@@ -1069,9 +1077,9 @@ def load_table(args):
         hvae.check_table("engineered_representations", table, module)
         return table
     # The encoder is trained on training actions only (but for "hvae-all"). Then it gives every
-    # action a representation, the unseen ones, too: the mean of q(c | observations). One table
+    # action a representation, the unseen ones, too: the mean of q(c | its recordings). One table
     # serves all seeds of the policy, as published: the encoder's seed stays 0.
-    path = Path(args.representation)  # a file that hvae.py has written, or how to make one
+    path = Path(args.representation)  # FILE.npz; else the name of a kind of encoder
     if path.suffix != ".npz":
         encoder_args = hvae.default_args(args.env, args.hvae_recipe, args.modality)
         changes = dict(split=args.split, split_seed=args.split_seed)
@@ -1099,11 +1107,10 @@ def start_from(agent, folder):
             raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
     if agent.args.method == "nearest-neighbor":
         # Its outputs are the old actions, so this layer starts anew; the stop head of this baseline
-        # does so as well [code], for no known reason. The loaded weights of these layers are
-        # replaced by this agent's untrained ones.
-        own = agent.state_dict()
-        anew = [name for name in own if name.startswith(("head.", "fc_stop."))]
-        theirs["agent"].update({name: own[name] for name in anew})
+        # does so as well [code], for no known reason.
+        for name, untrained in agent.state_dict().items():
+            if name.startswith(("head.", "fc_stop.")):
+                theirs["agent"][name] = untrained
     restore(theirs, folder, agent=agent)
 
 
@@ -1131,7 +1138,7 @@ def check(args):
         raise UserError("device cuda: PyTorch finds no GPU here")
     if args.finetune and not (Path(args.finetune) / "results.json").exists():
         raise UserError(f"{args.finetune} is not the folder of a finished run")
-    # A rollout is cut into whole steps of all environments, and into equal shares of processes.
+    # T has to be whole; processes get equal shares of environments and minibatches.
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs:
         raise UserError(f"num_envs {args.num_envs} must divide the {size} steps of a rollout")
@@ -1172,7 +1179,7 @@ def claim_folder(args):
     folder.mkdir(parents=True, exist_ok=True)
     # Two processes in one folder would mix their rows. The operating system frees a lock when its
     # process ends, however it ends. Python would free it with the object `lock`, at the end of this
-    # function, so atexit keeps the object. (is_singleton: one process may claim a folder twice.)
+    # function, so atexit keeps the object. (is_singleton: a notebook can claim it again.)
     lock = FileLock(folder / ".lock", is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -1238,7 +1245,7 @@ class Log:
         self.path = folder / "metrics.csv"
         self.path.touch()
         os.truncate(self.path, size)  # rows after the checkpoint are made again
-        self.writer = SummaryWriter(folder, purge_step=step + 1)
+        self.writer = SummaryWriter(folder, purge_step=step + 1)  # drops later events
         print(f"run: {folder}", flush=True)
         steps = dict(total=args.total_timesteps, initial=step)
         self.bar = tqdm(**steps, unit="step", unit_scale=True, disable=None)  # only on a terminal
@@ -1270,7 +1277,7 @@ def finish(folder, agent, phases, step, seconds):
     results = dict(metric=metric, seed=args.seed, command=shlex.join(sys.orig_argv))
     results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
     for name in TESTED:
-        if name in phases:  # C.2 has only "train"
+        if name in phases:  # C.2 has only "train": the test actions, which are now "seen"
             results[name] = evaluate(agent, phases[name], args.eval_episodes, (args.seed, TEST))
     write_json(folder / "results.json", results)  # first, in case the screen is gone
 

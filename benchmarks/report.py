@@ -63,6 +63,10 @@ ENVIRONMENTS = {  # title, what a score is
     "create": ("CREATE", "success rate"),
     "stacking": ("Shape Stacking", "height"),
 }
+# All other methods of these two differ from the published ones, whose scores get a star: ours are
+# conditioned (C.4) in CREATE, and have encoders with a linear path in Shape Stacking.
+LIKE = {"create": ("ours", "ours_conditioned_auxiliary")}
+LIKE["stacking"] = ("engineered", "non_hierarchical_vae")
 # The best that unseen actions allow. Grid World: all but 1 in 7,000 sets of skills allow a path.
 # Recommender: greedy play, told the user, but the popularity only if it is in the vector.
 CEILINGS = {"gridworld": 1.0, "recsys": 0.301, "recsys_full": 0.659}
@@ -103,14 +107,15 @@ def rows_of(figure: str) -> list[dict]:
 
 
 def published(figure: str, place: Place, method: str, phase: str) -> tuple:
-    """Published mean and standard deviation of one cell's phase; (None, None) without them."""
+    """Published mean and standard deviation of one cell's phase (or None), and "*" if unlike."""
     env, task = place[0], place[1].split(",")[0]
     if figure in ANALYSES:
         env, phase = ANALYSES[figure][0], phase.split("=")[1]
+    star = "" if method in LIKE.get(place[0], METHODS) else "*"
     found = PUBLISHED.get((env, task, method, phase))
-    if found is None and method == "ours_conditioned_auxiliary":  # without this head
-        found = PUBLISHED.get((env, task, "ours", phase))
-    return found or (None, None)
+    if found is None and method == "ours_conditioned_auxiliary":
+        found, star = PUBLISHED.get((env, task, "ours", phase)), "*"
+    return *(found or (None, None)), star
 
 
 def tested(phase: str) -> float:
@@ -167,19 +172,17 @@ def table(figure: str, cells: Cells) -> str:
         line = [*names(place, method), str(max(map(len, cell.values())))]
         for phase in phases:
             seeds = cell.get(phase, [])
-            theirs, _ = published(figure, place, method, phase)
+            theirs, _, star = published(figure, place, method, phase)
             text = f"{mean(seeds):.3f}" if seeds else ""
             if len(seeds) > 1:
                 text += f"±{pstdev(seeds):.3f}"
             if seeds and theirs is not None:
-                text += f" ({theirs:.3f})"
+                text += f" ({theirs:.3f}{star})"
             line.append(text)
-        known = "test" in cell and place[0] in CEILINGS
-        line.append(f"{CEILINGS[place[0]]:.3f}" if known else "")
+        line.append(f"{CEILINGS[place[0]]:.3f}" if "test" in cell and place[0] in CEILINGS else "")
         lines.append(line if named else ["", *line[1:]])
     heads = [HEADS.get(p, p.split("=")[-1] if figure in ANALYSES else p) for p in phases]
-    corner = ANALYSES.get(figure, (figure, " "))[1]
-    head = [corner, "method", "steps", "seeds", *heads, "ceiling"]
+    head = [ANALYSES.get(figure, ("", " "))[1], "method", "steps", "seeds", *heads, "ceiling"]
     keep = [i for i in range(len(head)) if any(line[i] for line in lines)]  # no empty columns
     lines = [head, ["---"] * len(head), *([text or "-" for text in line] for line in lines)]
     return "\n".join("|" + "|".join(line[i] for i in keep) + "|" for line in lines)
@@ -215,8 +218,7 @@ def draw_bars(path: Path, cells: Cells) -> None:
     key |= {"published": Patch(**outline), "seed": Line2D([], [], color="0", marker=".", ls="")}
     for place, axis in zip(places, axes, strict=True):
         if place[0] in CEILINGS:
-            line = dict(color="0.5", lw=0.8, ls="--")
-            key["ceiling, unseen"] = axis.axvline(CEILINGS[place[0]], **line)
+            key["ceiling, unseen"] = axis.axvline(CEILINGS[place[0]], color="0.5", lw=0.8, ls="--")
     for (place, method), cell in cells.items():
         axis = axes[places.index(place)]
         title, _, steps = names(place, method)
@@ -228,8 +230,8 @@ def draw_bars(path: Path, cells: Cells) -> None:
             if seeds:
                 axis.barh(at, mean(seeds), 0.36, color=METHODS[method][1], alpha=alpha)
                 axis.plot(seeds, [at] * len(seeds), ".", color="black", ms=3, zorder=3)
-                theirs, _ = published("", place, method, phase)
-                axis.barh(at, theirs or 0, 0.36, **outline)
+                theirs, _, star = published("", place, method, phase)
+                axis.barh(at, 0 if star else theirs or 0, 0.36, **outline)
     axes[0].set_yticks(range(len(methods)), [names(places[0], method)[1] for method in methods])
     axes[0].invert_yaxis()
     figure.legend(key.values(), key, ncols=5, **LEGEND)
@@ -267,7 +269,7 @@ def lines_of(figure: str, cells: Cells, zero: dict[Place, float]) -> dict[str, l
         color = METHODS[method][1]
         panel.append((label, phases, dict(color=color, marker=mark)))
         both = {phase: published(figure, place, method, phase) for phase in phases}
-        theirs = {phase: [m - std, m + std] for phase, (m, std) in both.items() if m is not None}
+        theirs = {p: [m - std, m + std] for p, (m, std, _) in both.items() if m is not None}
         if theirs:
             look = dict(color=color, ls=":", marker="s", mfc="white", alpha=0.5)
             panel.append((f"{label.removesuffix(', conditioned')}, published", theirs, look))

@@ -88,15 +88,15 @@ def test_a_table_shows_every_budget_and_like_beside_like(tmp_path, monkeypatch):
     assert "|HVAE + utility|10M|2|0.800±0.100 (0.904)|0.800±0.100 (0.703)|1.000|\n" in text
     assert "|HVAE + utility|1M|1|0.200" in text and "|mine|1M|1|0.300" in text
     assert text.endswith("![gridworld](gridworld.png)\n<!-- end:gridworld -->\nb\n")
-
-    # CREATE's fast recipe has the head of C.4, and so has the published score beside it.
+    # CREATE's fast recipe has the head of C.4. Where the published one lacks it, there is a star.
     same = dict(env="create", task="push", recipe="fast", phase="test", steps=9, score=0.5)
     same["method"] = "ours_conditioned_auxiliary"
-    rows = [same | change for change in ({}, {"split": "random"}, {"recipe": "older"})]
+    other = {"split": "random", "task": "ladder"}
+    rows = [same | change for change in ({}, other, {"recipe": "older"})]
     paper.merge(tmp_path / "create-push.csv", paper.COLUMNS, paper.KEY, rows)
     text = report.section("create-push", False)
     assert "|CREATE push|HVAE + utility, conditioned|0M|1|0.500 (0.861)|\n" in text
-    assert "|CREATE push, random split|HVAE + utility, conditioned|0M|1|0.500 (0.861)|\n" in text
+    assert "|CREATE ladder, random split|HVAE + utility, conditioned|0M|1|0.500 (0.669*)|" in text
     assert "|CREATE push, older recipe|HVAE + utility, conditioned|0M|1|0.500 (0.861)|\n" in text
     method, place = same["method"], ("create", "push", 9)
     assert report.published("analysis-embedding", place, method, "d=0.5")[0] is None  # other units
