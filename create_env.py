@@ -47,6 +47,7 @@ a ball is a contact rule (`make_space`). If a rule raises, pymunk prints the exc
 
 import io
 import multiprocessing
+import os
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -398,14 +399,14 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
     """`ids`, sorted, int64 (m,); ValueError unless distinct, known, and m >= num_available >= 1."""
-    ids = np.sort(np.asarray(ids))
+    ids = np.asarray(ids)
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
-    if len(ids) == 0 or ids[0] < 0 or ids[-1] >= NUM_ACTIONS:
+    if len(ids) == 0 or ids.min() < 0 or ids.max() >= NUM_ACTIONS:
         raise ValueError(f"action ids must lie in 0..{NUM_ACTIONS - 1}")
     if not 1 <= num_available <= len(ids):
         raise ValueError(f"{num_available} available actions out of a pool of {len(ids)}")
-    return ids.astype(np.int64)
+    return np.sort(ids).astype(np.int64)
 
 
 def angle_gaps(action_ids: Sequence[int], train_ids: Sequence[int]) -> np.ndarray:
@@ -604,7 +605,7 @@ MUZZLE = (5.0, 3.65)  # [code] units, half the unturned box: a shot starts (5 co
 # funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees, a bucket's at 135, 225, 315 and 45.
 LAST_CORNER = {"Funnel": 30, "Bucket": 45}
 # [code] The probe ball touches the no-op when its centre is within 0.1 sqrt(8) norm, 11.9 units. A
-# disc smaller by the ball's radius is touched exactly then; as a GOAL it does nothing to the ball.
+# disc smaller by its radius is touched exactly then ([here] at any step). A GOAL, it is only felt.
 NO_OP_RADIUS = 0.1 * sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
@@ -1099,7 +1100,7 @@ class CreateEnv(gym.Env):
         # that its penalty never fires; [here] as the appendix.
         if max(map(abs, position)) > 1.0:
             return "outside"
-        # appendix: "overlap over existing objects"; [code] refuses a tool that is so near to an
+        # appendix: "overlap ... over existing objects"; [code] refuses a tool that is so near to an
         # earlier one, or whose exact shape touches anything in the scene; [here] as [code].
         if any(dist(position, centre) <= MIN_TOOL_GAP for centre in self._centres):
             return "too close"
@@ -1117,7 +1118,7 @@ class CreateEnv(gym.Env):
 
     def _judge(self) -> tuple[bool, int, bool]:
         """What this action achieved: (goal reached, subgoals reached, target hit just now)."""
-        # First the target hit: the target has moved far enough from its start, and the marker has
+        # First ([code]: last) the target hit: the target is far from its start, and the marker has
         # touched it if the task asks for that. [code] Off the screen it counts as at the edge.
         hit_now = False
         if not self._target_hit:
@@ -1247,7 +1248,7 @@ PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
 # For hvae.py: it turns a first state into (x - centre) / half_width, so leaves it as it is, and
 # divides differences between states by step. [here] step is 4 pixels, 4 / 42 norm: the decoder's
-# smallest standard deviation, exp(-2) = 0.135 steps, is half a pixel, the finest a picture shows.
+# smallest standard deviation, exp(-2) = 0.135 steps, is half a pixel, all that a video shows.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1422,6 +1423,7 @@ def portraits(tools: Sequence[Tool], columns: int, units: float = 36.0) -> np.nd
 
 def draw_sheet(name: str, pool: np.ndarray):
     """A matplotlib figure: "tasks", "tools", or "probe" with three tools of `pool`."""
+    os.environ.pop("MPLBACKEND", None)  # a notebook sets it to one that may not be installed here
     from matplotlib.figure import Figure  # here, so that training does not need it
 
     pictures = {}  # title: square picture
@@ -1527,8 +1529,6 @@ class Args:
 
 def main(args: Args) -> None:
     """Draw what was asked for and say where it is."""
-    if args.tries < 1:
-        raise SystemExit(f"error: --tries {args.tries} is less than one episode")
     pool = split_actions()["train"]
     if args.tools:
         pool = np.flatnonzero(np.isin(action_labels(), args.tools) & IS_COARSE)

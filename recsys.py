@@ -116,14 +116,14 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
     """`ids`, sorted, int64 (m,); ValueError unless distinct, known, and m >= num_available >= 1."""
-    ids = np.sort(np.asarray(ids))
+    ids = np.asarray(ids)
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
-    if len(ids) == 0 or ids[0] < 0 or ids[-1] >= NUM_ACTIONS:
+    if len(ids) == 0 or ids.min() < 0 or ids.max() >= NUM_ACTIONS:
         raise ValueError(f"action ids must lie in 0..{NUM_ACTIONS - 1}")
     if not 1 <= num_available <= len(ids):
         raise ValueError(f"{num_available} available actions out of a pool of {len(ids)}")
-    return ids.astype(np.int64)
+    return np.sort(ids).astype(np.int64)
 
 
 # ---- A.2 the environment: click, sessions, state, reward ----
@@ -319,7 +319,7 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 # products while mu is hidden, since c says nothing about mu (for a policy that remembers no
 # clicks). The oracle knows mu, too, and always recommends the likeliest click; it does not plan
 # ahead. The numbers are the CTR with 500 available test products (10,000 episodes, this script's
-# default seed, 5; standard errors 0.002).
+# default seed, 5; standard errors up to 0.002).
 POLICIES = {
     "random": lambda taste, mu, rng: rng.random(len(mu)),  # 0.158
     "c-only": lambda taste, mu, rng: taste,  # 0.302

@@ -294,14 +294,14 @@ def mass_properties(family: Family) -> tuple:
 # ---- A.4: ids, labels, features, split ----
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
     """`ids`, sorted, int64 (m,); ValueError unless distinct, known, and m >= num_available >= 1."""
-    ids = np.sort(np.asarray(ids))
+    ids = np.asarray(ids)
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
-    if len(ids) == 0 or ids[0] < 0 or ids[-1] >= NUM_ACTIONS:
+    if len(ids) == 0 or ids.min() < 0 or ids.max() >= NUM_ACTIONS:
         raise ValueError(f"action ids must lie in 0..{NUM_ACTIONS - 1}")
     if not 1 <= num_available <= len(ids):
         raise ValueError(f"{num_available} available actions out of a pool of {len(ids)}")
-    return ids.astype(np.int64)
+    return np.sort(ids).astype(np.int64)
 
 
 def action_labels() -> np.ndarray:
@@ -641,9 +641,9 @@ class StackingEnv(gym.Env):
         shape_id = self.available[choice]
         inside = (np.abs(position) <= 1).all()
 
-        # Drop the shape and wait until the scene has settled. Coordinates that the agent does not
-        # decide are 0, the centre of the table (C.6). [code] What still moves, because 300 steps
-        # were not enough, is halted first; it makes no measurable difference.
+        # Drop the shape and wait until the scene has settled ([code]: without a new one as well).
+        # Coordinates that the agent does not decide are 0, the table's centre (C.6). [code] What
+        # still moves after 300 steps is halted first; it makes no measurable difference.
         if inside and shape_id not in self.shape_ids[2:] and not stop:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))

@@ -228,7 +228,7 @@ def test_what_does_not_exist_is_refused(module):
         create(render_mode="human")
     unknown = [1, 2, module.NUM_ACTIONS]
     for pool, K in (([1, 2, 3], 5), ([1, 2, 2, 3], 2), (unknown, 2), ([1, 2, 3], 0), ([[1, 2]], 1),
-                    ([1.0, 2.0], 2), ([-1, 2], 2), ([], 1)):  # fmt: skip
+                    ([1.0, 2.0], 2), ([-1, 2], 2), ([], 1), (5, 1)):  # fmt: skip
         with pytest.raises(ValueError):
             create(np.array(pool), K)
 

@@ -432,7 +432,7 @@ def test_a_run_that_diverges_says_so(tmp_path):
 
 # ---- options ----
 REFUSED = """gridworld --num-available 600; 600 available
-gridworld --num-available 0; 0 available
+gridworld --eval-episodes 0; must be at least 1
 gridworld --total-timesteps 10; one rollout takes 2048
 gridworld --num-envs 33; num_envs 33 must divide
 gridworld --representation missing.npz; missing.npz
@@ -442,7 +442,6 @@ gridworld --split fulll; 'fulll'; allowed: default
 create --task pus; 'pus'; allowed: push
 gridworld --modality sound --representation hvae; 'sound'; allowed: xy
 gridworld --finetune nowhere; nowhere is not the folder of a finished run
-chess; chess
 nowhere.py; nowhere.py
 evaluate nowhere; nowhere/best.pt is no checkpoint"""
 
@@ -669,8 +668,9 @@ def test_adaptation_is_to_the_whole_test_set_from_scratch_or_from_a_run(tmp_path
     changed = {k for k in source if not torch.equal(weights[k], source[k])}
     head = {"head.weight"} if method == "nearest-neighbor" else set()
     assert changed - {"head.bias"} == head  # published: its outputs are new
-    with pytest.raises(UserError, match="cannot be fine-tuned: its split_seed is 0"):
-        small(tmp_path, "--finetune", first, "--method", method, "--split-seed", 1)
+    for option, there in (("--split-seed", "split_seed is 0"), ("--task", "task is None")):
+        with pytest.raises(UserError, match=f"cannot be fine-tuned: its {there}"):
+            small(tmp_path, "--finetune", first, "--method", method, option, 1)
 
 
 # ---- torchrun ----

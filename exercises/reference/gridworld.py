@@ -110,14 +110,14 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
 def check_ids(ids: Sequence[int], num_available: int = 1) -> np.ndarray:
     """`ids`, sorted, int64 (m,); ValueError unless distinct, known, and m >= num_available >= 1."""
-    ids = np.sort(np.asarray(ids))
+    ids = np.asarray(ids)
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
         raise ValueError("action ids must be a list of distinct integers")
-    if len(ids) == 0 or ids[0] < 0 or ids[-1] >= NUM_ACTIONS:
+    if len(ids) == 0 or ids.min() < 0 or ids.max() >= NUM_ACTIONS:
         raise ValueError(f"action ids must lie in 0..{NUM_ACTIONS - 1}")
     if not 1 <= num_available <= len(ids):
         raise ValueError(f"{num_available} available actions out of a pool of {len(ids)}")
-    return ids.astype(np.int64)
+    return np.sort(ids).astype(np.int64)
 
 
 # ---- A.1 State: the grids; what a skill does in them ----
@@ -186,7 +186,7 @@ class GridWorldEnv(gym.Env):
     `action_pool`: ids that `available` is drawn from (default: training skills of split seed 0).
     `num_available`: K (Table 3: 50). `render_mode`: None or "rgb_array".
     `reset(options={"layout": n})` chooses the layout: n = 7 * (river - 3) +
-    opening - 1, and 21 more when the river is a row. ValueError for whatever does not exist.
+    opening - 1, and 21 more when the river is a row. ValueError for an unknown layout.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}

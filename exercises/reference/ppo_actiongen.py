@@ -158,7 +158,7 @@ class Args:
     # --- run ---
     runs_dir: str = "runs"  # folder of runs and representations
     run_name: str | None = None  # name of the run's folder; None: see run_name_of
-    resume: bool = False  # go on from the last checkpoint, bit for bit on one kind of CPU
+    resume: bool = False  # go on from the last checkpoint, bit for bit with as many processes
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
     def __post_init__(self):
@@ -185,6 +185,9 @@ TABLE_3 = {
     # As in [code]; but for Stacking 200, not 40, which cannot tell checkpoints apart [here].
     "valid_episodes": (640, 160, 640, 200),
 }
+# Where [code] has other numbers for a single method or test, Tables 3 and 4 are kept [here]: the
+# continuous baseline (T = 256), no subsampling in CREATE (six minibatches), the Recommender (50
+# available in validation; with `fully_observable` 25 in tests, and 80M steps).
 # Each column of the table, put over the defaults of Args, is the recipe of one environment.
 PRESETS = {}
 for number, environment in enumerate(TABLE_3["env"]):
@@ -1101,7 +1104,7 @@ def start_from(agent, folder):
     # With another split, the old policy would have been trained with some "new" actions. Options
     # that decide the sizes of layers are not compared: `restore` names the layers that do not fit.
     theirs = load(folder / "best.pt")
-    for name in ("env", "method", "split", "split_seed"):
+    for name in ("env", "task", "method", "split", "split_seed"):
         there = getattr(theirs["args"], name)
         if there != getattr(agent.args, name):
             raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
@@ -1115,10 +1118,10 @@ def start_from(agent, folder):
 
 
 def choose_device(args):
-    """The device of --device; under torchrun, each process has a GPU of its own."""
+    """The device of --device; under torchrun, processes take the GPUs in turn."""
     if args.device == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
 
 
 def check(args):
@@ -1138,6 +1141,8 @@ def check(args):
         raise UserError("device cuda: PyTorch finds no GPU here")
     if args.finetune and not (Path(args.finetune) / "results.json").exists():
         raise UserError(f"{args.finetune} is not the folder of a finished run")
+    if min(args.valid_episodes, args.eval_episodes) < 1:
+        raise UserError("valid_episodes and eval_episodes must be at least 1")
     # T has to be whole; processes get equal shares of environments and minibatches.
     size = args.minibatch_size * args.num_minibatches
     if size % args.num_envs:
@@ -1172,8 +1177,8 @@ def run_name_of(args):
 def claim_folder(args):
     """The run's folder, new or to be resumed; no other process may write there as long as we live.
 
-    UserError if another process does, if there is a checkpoint but no --resume, or if --resume
-    comes with other options than the run was started with.
+    UserError if another process does, if there is a checkpoint but no --resume, or if it is of
+    other options (which mostly name another folder, and so a new run).
     """
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
@@ -1193,6 +1198,8 @@ def claim_folder(args):
         for name, there in vars(load(path)["args"]).items():
             if there != getattr(args, name) and name not in FREE:
                 raise UserError(f"cannot resume {folder}: its {name} is {there!r}")
+    elif args.resume:
+        print(f"note: {folder} has no checkpoint, so a new run starts", flush=True)
     return folder
 
 
@@ -1260,6 +1267,7 @@ class Log:
         if row["train_score"] is not None:
             scores = "seen {train_score:.3f}, validation {valid_score:.3f}".format(**row)
             self.bar.write(f"step {row['step']:,}: {scores}")
+            self.writer.flush()  # a checkpoint follows, and what is before it is not made again
         return self.path.stat().st_size
 
     def close(self):
@@ -1342,7 +1350,7 @@ class EvaluateArgs:
     run: tyro.conf.Positional[str]  # the run's folder
     actions: Literal["train", "valid", "test"] = "test"  # which part of the split to draw from
     num_available: int | None = None  # K; None: as in the run's own test
-    min_angle_gap: float | None = None  # CREATE: tools at least so many degrees from all known
+    min_angle_gap: float | None = None  # CREATE: at least so many degrees from known tools
     min_embedding_distance: float | None = None  # share: .3 leaves out the 30 % nearest to known
     unseen_ratio: float | None = None  # this share of unseen actions, the rest training actions
     episodes: int = 5000  # episodes to play
@@ -1362,19 +1370,20 @@ def restrict_pool(options, module, table, pool, known):
         if share is not None and not 0 <= share <= 1:
             raise UserError(f"{share} is no share between 0 and 1")
     if far is not None:
-        # Distance to the nearest representation of a training action. [code] has limits in units
-        # of this distance, which fit one encoder; a share of the pool fits all of them [here].
+        # Distance to the nearest representation of a training action. [code] has limits on its
+        # square, which fit one encoder; a share of the pool fits all of them [here].
         distances = torch.cdist(table[pool].double(), table[known].double())  # (m, n)
         nearest = distances.amin(1).numpy()
         pool = pool[nearest >= np.quantile(nearest, far)]
     if gap is not None:
-        # Only tools that differ by so much from every training tool's angle.
+        # Only tools that differ by so much from the angle of every training tool of their class.
         if not hasattr(module, "angle_gaps"):
             raise UserError("min_angle_gap: only the tools of CREATE have angles")
         pool = pool[module.angle_gaps(pool, known) >= gap]
     if ratio is not None:
         # A mixture as large as the smaller of `pool` and `known`, so that only the share differs
-        # between two evaluations. The same mixture for all runs: seed 0.
+        # between two evaluations. The same mixture for all runs: seed 0 [here]. [code] takes the
+        # first actions of both, the unseen ones out of those with a squared distance above 3.
         rng = np.random.default_rng(0)
         size = min(len(pool), len(known))
         num_unseen = round(ratio * size)
