@@ -36,7 +36,7 @@ and y as whole numbers 0-79, at most 39 from those of the first state and of the
 "image" it is (S, S), of "video" (L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on
 seed *and* id: several calls are made, each may start `workers` processes.
 Marks: "appendix", that of Generalization to New Actions in RL (ICML 2020); [code], the authors'
-program; [here], our choice, and why. Where all three stand, the last is what this file does.
+program; [here], our choice, and why. The last of those that stand is what this file does.
 """
 
 import hashlib
@@ -69,7 +69,7 @@ ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
 VISUAL = ("image", "video")  # modalities that pass the convolutions; all others are trajectories
-CLASSES = 80  # B: "two 80-dimensional one-hot vectors"
+CLASSES = 80  # appendix B: "two 80-dimensional one-hot vectors"
 RECIPES = ("quick", "fast", "paper")
 
 
@@ -78,7 +78,7 @@ class Args:
     """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
 
     env: Annotated[str, tyro.conf.Positional]  # gridworld, create, stacking, or a file: my_env.py
-    modality: str  # create: state (default; [code]: tool, ball, velocity), xy (B's default), video
+    modality: str  # create: state (default; [code]: tool, ball, velocity), xy (as in B), video
     recipe: Literal[RECIPES]  # which column of HYPERPARAMETERS gives the numbers
     hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline
     train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, on all parts
@@ -111,7 +111,7 @@ class Args:
 # default, takes minutes on a CPU, more for pictures; "quick" is shorter, or the same. Counts and
 # rates of both are [here]: tried by hand, judged by `probe` (on validation and test actions).
 # fmt: off
-HYPERPARAMETERS = {  # columns: quick, fast, paper
+HYPERPARAMETERS = {  # of Grid World and files of your own; columns: quick, fast, paper
     "representation_size": (16,    16,    16),      # Table 3
     "batch_size":          (128,   128,   128),     # Table 3
     "epochs":              (0,     0,     10_000),  # Table 3
@@ -120,10 +120,10 @@ HYPERPARAMETERS = {  # columns: quick, fast, paper
     "hidden":              (64,    64,    64),      # Table 4
     "q_hidden":            (128,   128,   128),     # Table 4
     "observations":        (64,    64,    1024),    # Table 4; 64: more gave no better policy
-    # Observations of one action differ little: many small updates teach more than few large ones.
-    # appendix: 1,024 (recorded or used?); [code] 45 to 672, by environment; [here] "paper": all.
+    # Observations of a skill differ in the start only: many small updates beat few large ones.
+    # appendix: 1,024 (recorded or used?); [code] 45 to 672; [here] "paper": all, 52 of pictures.
     "batch_observations":  (4,     4,     1024),
-    # With the ELBO's divisor, 4, only 5 of 16 dimensions of c are in use, with 64 10 (exercises/).
+    # With the ELBO's divisor, 4, c uses only 5 of its 16 dimensions; with 64, 10 (exercises/).
     "kl_c_divisor":        (64,    64,    1024),
     # Grid World's raw cells run from 1 to 78, a move changes them by 1: the networks would first
     # have to learn to subtract. Differences show the skill from the first update.
@@ -150,13 +150,12 @@ EXCEPTIONS = {
         "updates":             (1_250, 2_500, 0),
         "observations":        (128,   1024,  1024),    # quick: a minute of recording
     },
-    # appendix: a default width of 64; [code] 128 for pictures; [here] as the code.
     "image": {
         "representation_size": (128,   128,   128),     # Table 3
         "batch_size":          (16,    16,    32),      # Table 3
         "observations":        (64,    1024,  1024),
         "epochs":              (0,     0,     5_000),   # Table 3
-        "hidden":              (128,   128,   128),
+        "hidden":              (128,   128,   128),     # appendix: 64; [code] and [here] 128
         "learning_rate":       (2e-3,  2e-3,  1e-3),
         "batch_observations":  (4,     4,     52),      # [code]; 1,024 would need 65 GB of memory
         "kl_c_divisor":        (1024,  1024,  52),      # fast: as in CREATE
@@ -167,10 +166,10 @@ EXCEPTIONS = {
     },
 }
 # appendix: Table 3 has one column for all of CREATE; [code] its videos have the numbers of
-# Shape Stacking's pictures; [here] as the code. 1,024 videos of every tool are 35 GB.
+# Shape Stacking's pictures; [here] as the code.
 EXCEPTIONS["video"] = EXCEPTIONS["image"] | {
         "updates":             (200,   600,   0),
-        "observations":        (16,    128,   1024),
+        "observations":        (16,    128,   1024),    # 1,024 of every tool: 35 GB
         "linear_path":         (False, False, False),   # not tried here
 }
 # fmt: on
@@ -292,8 +291,8 @@ class SumReLU(nn.Module):
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
-    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. A norm per dimension would
-    # scale even an unused dimension of c to variance 1, which costs KL; here it stays small.
+    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. A norm per dimension would at
+    # first spread the means of an unused dimension of c to variance 1: a KL; here they stay small.
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
@@ -336,8 +335,8 @@ def conv_encoder(side):
 class TrajectoryEncoder(nn.Module):
     """Bi-LSTM Encoder: sequences (B, L, F) -> (B, H), 2 layers, averaged over time [code]."""
 
-    # appendix: to a 64-dimensional vector; [code] 64 per direction, directions averaged; [here] as
-    # the code, or `compact`: 32 per direction, concatenated, which makes 64, too.
+    # appendix: to a 64-dimensional vector; [code] H per direction, directions averaged; [here] as
+    # the code, or `compact`: H / 2 per direction, concatenated, which makes H, too.
     def __init__(self, features, hidden, compact):
         super().__init__()
         self.hidden = hidden
@@ -378,7 +377,7 @@ class ObservationInference(nn.Module):
             Residual(hidden, 2), Residual(hidden, 2), nn.Linear(hidden, size), GlobalBatchNorm()
         )
         # appendix: networks output the log-variances of q(z|x,c) and the decoder; [code] these and
-        # that of p(z|c) are learned constants, from N(0, 1); [here], too (but the decoder's start).
+        # that of p(z|c) are learned constants, from N(0, 1); [here] too (decoder: log_var_start).
         self.log_var = nn.Parameter(torch.randn(size))
 
     def forward(self, *inputs):
@@ -405,8 +404,8 @@ class ObservationDecoder(nn.Module):
             return self.output(effect)[:, None]
         # By this product the start can cancel the effect: beside a wall, a move does nothing.
         gated = effect * self.start(start)  # (B, H)
-        # appendix: this vector is the LSTM's input, it does not say how; [code] a new product at
-        # every step, with the state predicted last; [here] the same at each: it learns sooner.
+        # The LSTM's input. appendix: not said how; [code] a new product at every step, with the
+        # prediction of the step before; [here] one for all steps: the model learns sooner.
         sequence = gated[:, None].expand(-1, self.steps, -1)  # (B, T, H)
         return self.output(self.lstm(sequence)[0])  # (B, T, F)
 
@@ -433,7 +432,7 @@ def conv_decoder(side, mask):
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
 
-# ---- B: the two models; first what they share ----
+# ---- appendix B: the two models; first what they share ----
 
 
 class ObservationModel(nn.Module):
@@ -544,9 +543,10 @@ class HVAE(ObservationModel):
         return self.posterior(h).mean
 
     def infer(self, h):
-        # Encoded observations (A, n, E) -> latents (z, c), KL of z (B, Z), KL of c (A, C).
+        # Encoded observations (A, n, E) -> latents (z, c), KL of z (B, Z), KL of c (A, C). One
+        # sample of c for a set, one of z for each of its n observations.
         action = self.posterior(h)
-        c = action.rsample().repeat_interleave(h.shape[1], 0)  # one for a set: (A, C) -> (B, C)
+        c = action.rsample().repeat_interleave(h.shape[1], 0)  # (A, C) -> (B, C)
         observation = self.q_z(h.flatten(0, 1), c)
         kl_z = kl_divergence(observation, self.p_z(c))
         kl_c = kl_divergence(action, Normal(0.0, 1.0))
@@ -644,7 +644,7 @@ def observe(module, ids, args):
 
 
 def fit(model, data, rows, args):
-    """Maximise the objective on data[rows]; its terms in every update, a list of dicts."""
+    """Maximise the objective on data[rows]; return its terms in every update, a list of dicts."""
     groups = []
     for name, parameter in model.named_parameters():
         factor = args.log_var_rate if name.endswith("log_var") else 1.0
@@ -791,7 +791,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
 
 
 def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
-    """How well a table tells known facts of held-out actions (regressions learn on training's)."""
+    """How well a table tells known facts of held-out actions (regressions fit training actions)."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
     from sklearn.pipeline import make_pipeline

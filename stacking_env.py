@@ -57,8 +57,8 @@ try:
     import pybullet as p
 except ModuleNotFoundError:
     sentence = (
-        "Shape Stacking needs pybullet, which pip installs ready-made up to Python 3.11 only; "
-        "for a newer Python conda-forge has it: conda install -c conda-forge pybullet"
+        "Shape Stacking needs pybullet, which pip has ready-made for x86 Linux, Python 3.11; "
+        "for others conda-forge has it: conda install -c conda-forge pybullet"
     )
     # The script ends with the sentence alone; hvae.py, which imports it, catches the exception.
     error = SystemExit if __name__ == "__main__" else ModuleNotFoundError

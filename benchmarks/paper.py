@@ -26,7 +26,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -183,7 +183,7 @@ def expand(figure: str, row: str, seed: int, args: Args) -> Job:
         if word.startswith("{"):
             name = word.strip("{}")
             where = (figure, name) if name in TABLE[figure] else name.split("/", 1)
-            parent = expand(*where, seed, args)
+            parent = expand(*where, seed, replace(args, recipe="fast") if "fig4" in where else args)
             needs += [*parent.needs, parent]
             words[i] = parent.folder.as_posix()
     if kind == "evaluate":
@@ -350,7 +350,7 @@ def record(job: Job, args: Args) -> bool:
     if not found:
         print(f"  FAILED  {job.command}  (see {job.folder}.log)", flush=True)
         return False
-    name = job.figure + ("-paper" if args.recipe == "paper" else "")
+    name = job.figure + ("-paper" if getattr(job.args, "recipe", args.recipe) == "paper" else "")
     results = Path(args.results_dir)
     merge(results / f"{name}.csv", COLUMNS, KEY, found)
     picture = job.folder.with_name(f"{job.folder.stem}-tsne.png")
@@ -405,7 +405,8 @@ def main(args: Args) -> None:
     if args.dry_run:
         print("\n".join(dict.fromkeys(job.command for job in jobs)))
         return
-    finished = [job for job in jobs if score_rows(job)]  # a folder of another run is an error now
+    # Now, because a folder of another run is an error.
+    finished = [job for job in jobs if all(map(score_rows, [*job.needs, job]))]
     print(f"{len(jobs) - len(finished)} of {len(jobs)} commands to run", flush=True)
     failures = run_all(jobs if args.jobs else finished, args)
     if failures:

@@ -18,6 +18,7 @@ import re
 import sys
 import traceback
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 
@@ -169,17 +170,20 @@ def check_01(order):
     seen = float(order.largest_change(agent, state, available))
     expect(0 <= seen < 1e-4, "logits that change by rounding alone", f"a change of {seen:.2g}")
 
-    def by_place(encoding, shown):  # in the last state the first place is the best, whose ever
+    def by_place(
+        fall, encoding, shown
+    ):  # in the last state the first place is the best, whose ever
         logits = torch.zeros(shown.shape)
         logits[-1] = torch.arange(K, 0, -1)
         if not torch.equal(shown, available):
-            logits[-1] -= 100  # shuffled, all fall
+            logits[-1] -= fall  # of all, once they are shuffled
         return logits
 
-    agent.utility = by_place
-    seen = float(order.largest_change(agent, state, available))
-    expected = "a change where the logits go by the place (here: of the last state's actions)"
-    expect(seen >= 1, expected, f"a change of {seen:.2g}")
+    for fall in (0, 100):
+        agent.utility = partial(by_place, fall)
+        seen = float(order.largest_change(agent, state, available))
+        expected = "a change where the logits go by the place (here: of the last state's actions)"
+        expect(seen >= 1, expected, f"a change of {seen:.2g}")
 
 
 def check_02(ppo):
@@ -253,14 +257,22 @@ def check_05(ppo):
         expect("outcome_loss" in numbers[0], "a number outcome_loss", [*numbers[0]])
         first, last = numbers[0]["outcome_loss"], numbers[-1]["outcome_loss"]
         expect(last < 0.8 * first, "outcome_loss to fall in 20 updates", f"{first} to {last}")
-        # Where nothing else moves the utility, the outcome does.
+        # Where nothing else moves the utility, the outcome does, by its weight.
         mb = {name: x.flatten(0, 1) for name, x in batch.items()}
         mb["advantage"] = torch.zeros_like(mb["advantage"])
-        optimizer.zero_grad()
-        ppo.ppo_loss(agent, mb, 0.0)[0].backward()
-        gradient = agent.utility_hidden.weight.grad
-        learns = gradient is not None and gradient.abs().sum() > 0
+        gradients = []
+        for coef in (1.0, 0.5):
+            agent.args.outcome_coef = coef
+            optimizer.zero_grad()
+            ppo.ppo_loss(agent, mb, 0.0)[0].backward()
+            gradients.append(agent.utility_hidden.weight.grad)
+        learns = gradients[1] is not None and gradients[1].abs().sum() > 0
         expect(learns, "the utility's hidden layer to learn from the outcome", "no gradient")
+        ratio = (gradients[0].norm() / gradients[1].norm()).item()
+        expect(abs(ratio - 2) < 0.01, "twice the gradient with twice the outcome_coef", ratio)
+        given = ppo.ppo_loss(agent, mb, 0.0)[1]["outcome_loss"].item()
+        other = ppo.ppo_loss(agent, mb | {"done": 1 - mb["done"]}, 0.0)[1]["outcome_loss"].item()
+        expect(given != other, "outcome_loss to depend on `done`", "it does not")
         return numbers[-1]
 
     ppo.update = spy
@@ -312,11 +324,15 @@ def check_07(ppo):
     agent, before, envs, state, available = make(ppo, table, bilinear=True, num_available=512)
     rollout_and_update(ppo, agent, envs, num_steps=8)
     agent.utility_query.weight.data.zero_()
+    columns = []
     for d in range(table.shape[1]):
         agent.utility_query.bias.data.zero_()[d] = 1
         noise = log_probs(agent, state[:1], available[:1])[0] - before.table[available[0], d]
         ratio = (noise.std() / before.table[train_ids, d].std()).item()
         expect(0.42 < ratio < 0.58, "noise of 0.5 standard deviations of training actions", ratio)
+        columns.append(noise.numpy())
+    alike = np.abs(np.corrcoef(columns) - np.eye(len(columns))).max()
+    expect(alike < 0.3, "a draw for each number of the table", f"a correlation of {alike:.2f}")
 
     # The position head of C.4 reads representations, too: the odds of two positions change.
     agent, before, envs, *_ = make(ppo, aux_conditioned=True)
@@ -386,6 +402,14 @@ def check_09(ppo):
                     env.step(choice)
                     raise Wrong("expected a ValueError for a used skill; seen: none")
 
+    gridworld = load_environment("gridworld")  # three skills that end at the goal, all used
+    skills = sorted(gridworld.SKILL_NAMES.index(name) for name in ("RRRRR", "RDDDD", "DDLLL"))
+    env = gridworld.GridWorldEnv(skills, 3, once=True)
+    env.reset(options={"layout": 0})
+    for name in ("RRRRR", "RDDDD", "DDLLL"):
+        ended = env.step(skills.index(gridworld.SKILL_NAMES.index(name)))[2:4]
+    expect(ended == (True, False), "terminated, not truncated, at the goal", ended)
+
 
 def check_11(recsys):
     ids = np.argsort(-recsys.POPULARITY)[:40]  # a try is a click 6 times in 10
@@ -412,6 +436,18 @@ def check_11(recsys):
     for clicks, tries in first:
         expected = "first clicks as often as before, after every reset, for every product"
         expect(clicks > 0.45 * tries, expected, f"{clicks} clicks in {tries} tries")
+
+    for seed in range(200):  # after a click: the same product again, or another one, not clicked
+        users = []
+        for second in (0, 1):
+            env.reset(seed=seed)
+            for choice in (0, second):
+                if not env.ending:
+                    env.step(choice)
+            if list(map(bool, env.clicks)) == [True, False]:
+                users.append(env.user)
+        drawn = len(users) < 2 or np.allclose(*users)
+        expect(drawn, "the same random numbers, whether a product was clicked or not", "others")
 
     env = recsys.RecSysEnv(recsys.split_actions()["test"], 500)
     rng = np.random.default_rng(0)

@@ -27,6 +27,10 @@ CHANGES = {
         ("rounding alone", {"before[:, order]": "before"}),
         ("logits go by the place", {"torch.randperm": "torch.arange"}),
         ("logits go by the place", {".abs()": ""}),
+        (
+            "logits go by the place",
+            {"before[:, order]": "before.sort().values", "(after": "(after.sort().values"},
+        ),
     ],
     "02": [
         ("ok", {"project(self.table[available])": "project(self.table)[available]"}),
@@ -37,6 +41,8 @@ CHANGES = {
         ("no other layers", {"            if args.outcome_coef:": "            if True:"}),
         ("target of the first output", {'args.gamma * (1 - batch["done"])': "args.gamma"}),
         ("hidden layer to learn", {"(hidden @ agent": "(hidden.detach() @ agent"}),
+        ("twice the gradient", {"args.outcome_coef * outcome_loss": "outcome_loss"}),
+        ("depend on `done`", {'logits(end, mb["done"])': 'logits(end, 0 * mb["done"])'}),
     ],
     "06": [
         ("log-probabilities of 0.9 pi", {"explorer.log_prob": "policy.log_prob"}),
@@ -77,12 +83,20 @@ CHANGES = {
         ("no -1 taken", {"distance.masked_fill(available < 0, torch.inf)": "distance"}),
         ("probability 0", {"logits.masked_fill(available < 0, -torch.inf)": "logits"}),
         ("truncated when", {"(moves >= MAX_MOVES or nothing_left)": "(moves >= MAX_MOVES)"}),
+        (
+            "not truncated, at",
+            {"(moves >= MAX_MOVES or nothing_left)": "moves >= MAX_MOVES or nothing_left"},
+        ),
         ("observation space", {"-1 if once else 0": "0"}),
         ("a ValueError", {"if self.available[action] < 0": "if False"}),
     ],
     "11": [
         ("after every reset", {"self.clicked = []": "self.clicked = getattr(self, 'clicked', [])"}),
         ("no second click", {"self.clicked.append(product)": "self.clicked = [product]"}),
+        (
+            "the same random numbers",
+            {"bool(self.np_random": "product not in self.clicked and bool(self.np_random"},
+        ),
         ("`play` to recommend nothing", {"np.where(bought, -np.inf, score)": "score"}),
         ("CTR above 0.5 of oracle", {"score).argmax()": "-score).argmax()"}),
     ],

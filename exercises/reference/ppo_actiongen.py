@@ -1169,7 +1169,10 @@ def run_name_of(args):
         for option, value in vars(args).items():
             if value != usual[option] and option not in ("seed", *FREE):
                 words.append(option if value is True else f"{option}-{value}")
-        name = "-".join(words)[:120] + f"-s{args.seed}"
+        name = "-".join(words)
+        if len(name) > 120:
+            name = f"{name[:110]}-{hvae.short_hash(name)}"
+        name += f"-s{args.seed}"
     # Only characters that every file system takes, and not too many.
     return re.sub(r"^\.|[^A-Za-z0-9._-]", "_", name)[:140]
 
