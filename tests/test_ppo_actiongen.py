@@ -189,6 +189,15 @@ def test_small_pictures_are_means_of_blocks_and_zero_where_there_is_nothing():
     agent, _ = make_agent(HYBRID, FRAMES, small_pictures=True)
     near, far = (agent.encode(small[:1] // 4 * k)[0] for k in (1, 2))  # twice as dark, same code
     torch.testing.assert_close(near, far, rtol=0.05, atol=0.05)
+    agent, _ = make_agent(HYBRID, FRAMES)
+    torch.testing.assert_close(agent.encode(state)[0], agent.encoder(state / 255))
+
+
+def test_states_are_brought_to_mean_0_and_standard_deviation_1():
+    agent, _ = make_agent()
+    agent.obs_stats.update(torch.tensor([1.0, 5.0]).repeat(50_000)[:, None].expand(-1, 7))
+    state, same = torch.tensor([[[3.0, 5, 1, 3, 3, 3, 99]], [[0, 1, -1, 0, 0, 0, 10]]])
+    torch.testing.assert_close(agent.encode(state)[0], agent.encoder(same), rtol=0, atol=1e-3)
 
 
 def test_one_hot_states_name_each_of_the_ids_that_there_are():
@@ -333,7 +342,7 @@ def assert_same_run(a, b):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """The folder of one finished tiny run, and what it printed."""
-    folder = tmp_path_factory.mktemp("runs")
+    folder = tmp_path_factory.mktemp("it's here")
     # A backend inherited from a notebook is none of its business.
     environ = os.environ | {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
     return folder / "run", run("ppo_actiongen.py", *words(folder), env=environ)
@@ -348,20 +357,13 @@ def test_a_run_leaves_what_it_promises(finished):
     assert [r["step"] for r in rows_of(folder) if r["valid_score"]] == "768 1536 2304 3072".split()
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     assert results["test"]["episodes"] == 64 and results["metric"] == "success"
+    assert shlex.split(results["command"])[1:] == ["ppo_actiongen.py", *words(folder.parent)]
     assert f"run: {folder}" in out and "unseen" in out and out.count("step ") == 4
     assert "note:" not in out and out.isascii()  # a console of any code page can show it
     best = torch.load(folder / "best.pt", weights_only=True)
     assert set(best) == {"args", "agent", "step"}  # small: no optimiser
     scores = {r["step"]: float(r["valid_score"]) for r in rows_of(folder) if r["valid_score"]}
     assert str(best["step"]) == max(scores, key=scores.get)  # validation has chosen
-
-
-def test_one_seed_gives_one_run_and_its_command_can_be_pasted(finished, tmp_path):
-    folder = tmp_path / "it's here"
-    run("ppo_actiongen.py", *words(folder))
-    assert_same_run(finished[0], folder / "run")
-    command = json.loads((folder / "run" / "results.json").read_text(encoding="utf-8"))["command"]
-    assert shlex.split(command) == [sys.executable, "ppo_actiongen.py", *words(folder)]
 
 
 @pytest.mark.parametrize("rows", [1, 4])  # before the first checkpoint, and after it
@@ -464,11 +466,42 @@ def test_test_actions_neither_train_nor_choose(tmp_path, monkeypatch):
         pools.setdefault(stream[1], set()).update(phase[0])
         return make_envs(args, phase, num_envs, stream)
 
-    monkeypatch.setattr(ppo, "make_envs", spy)
-    small(tmp_path)
+    def score(agent, phase, n, stream, real=ppo.evaluate):
+        # Seen scores rise with the step, those of validation fall: the first checkpoint is best.
+        if stream[1] == ppo.TEST:
+            best = ppo.load(tmp_path / "run" / "best.pt")
+            same = [torch.equal(x, best["agent"][k]) for k, x in agent.state_dict().items()]
+            assert best["step"] == 256 and all(same)
+        rising = phase[0][0] in train
+        return real(agent, phase, n, stream) | {"score": stream[-1] if rising else -stream[-1]}
+
     train, valid, test = (set(ids) for ids in gridworld.split_actions().values())
+    monkeypatch.setattr(ppo, "make_envs", spy)
+    monkeypatch.setattr(ppo, "evaluate", score)
+    small(tmp_path)
     assert pools == {ppo.TRAINING: train, ppo.VALIDATION: train | valid,
                      ppo.TEST: train | valid | test}  # fmt: skip
+
+
+def test_the_entropy_bonus_and_the_learning_rate_fall(tmp_path, monkeypatch):
+    seen, loss = [], ppo.ppo_loss
+    monkeypatch.setattr(ppo, "ppo_loss", lambda *args: seen.append(args[2]) or loss(*args))
+    small(tmp_path)
+    assert seen[::16] == pytest.approx([0.05, 0.035, 0.02])
+    adam = ppo.load(tmp_path / "run" / "checkpoint.pt")["optimizer"]
+    assert adam["param_groups"][0]["lr"] == pytest.approx(4e-4)
+
+
+def test_advantages_come_from_scaled_rewards_and_the_next_state(tmp_path, monkeypatch):
+    batches, update = [], ppo.update
+    monkeypatch.setattr(ppo, "update", lambda *args: batches.append(args[2]) or update(*args))
+    small(tmp_path, "--learning-rate", 0, "--eval-every", 768)  # the critic stays as it is
+    b, after = batches[0], batches[1]["value"][0]
+    G, _ = ppo.running_returns(b["reward"], b["done"], torch.zeros(32), 0.99)
+    rewards = (b["reward"] / G.std(correction=0)).clamp(-10, 10)
+    expected = ppo.gae(rewards, b["value"], b["done"], after, 0.99)
+    assert b["reward"].any() and after.any()
+    torch.testing.assert_close(b["advantage"], expected, rtol=0.02, atol=0.02)
 
 
 def test_a_programming_error_shows_where_it_is(tmp_path, monkeypatch):
@@ -528,6 +561,22 @@ def test_every_environment_is_trained_and_tested(tmp_path, env):
     assert ppo.main([*line.split(), "--runs-dir", str(tmp_path)])["test"]["episodes"] == 4
 
 
+def test_options_of_a_task_reach_its_environment():
+    args = replace(ppo.default_args("create"), task="belt", subgoal_reward=False)
+    (env,) = ppo.make_envs(args, (np.arange(1, 9), 5), 1, (0,))[0].unwrapped.envs
+    assert env.unwrapped.task is create_env.TASKS["belt"] and not env.unwrapped.subgoal_reward
+
+
+def test_representations_made_by_hand_and_a_fixed_set_of_test_products():
+    args = replace(ppo.default_args("recsys"), fully_observable=True, adapt=True)
+    assert ppo.load_table(args).shape == (10_000, 17)
+    pool, K = ppo.action_phases(args)[0]["learn"]
+    test = ppo.hvae.load_environment("recsys").split_actions()["test"]
+    assert len(pool) == K == 2000 and np.isin(pool, test).all()
+    args = replace(ppo.default_args("gridworld"), representation="engineered-5d")
+    assert ppo.load_table(args).shape == (1024, 5)
+
+
 @pytest.mark.parametrize(
     "name, changes",
     [("hvae", {}), ("hvae-all", {"train_on": "all"}), ("vae", {"hierarchical": False})],
@@ -542,10 +591,10 @@ def test_the_encoder_that_is_asked_for_is_trained_once(tmp_path, monkeypatch, na
 
     monkeypatch.setattr(ppo.hvae, "train", fake)
     args = replace(ppo.default_args("gridworld"), representation=name, split_seed=3)
-    args.runs_dir = str(tmp_path)
+    args = replace(args, runs_dir=str(tmp_path), hvae_recipe="paper")
     assert all(ppo.load_table(args).shape == (1024, 4) for _ in range(2))
     (one,) = made
-    assert one == replace(ppo.hvae.default_args("gridworld"), split_seed=3, device="auto",
+    assert one == replace(ppo.hvae.default_args("gridworld", "paper"), split_seed=3, device="auto",
                           runs_dir=str(tmp_path), **changes)  # fmt: skip
 
 
@@ -596,14 +645,18 @@ def test_the_no_op_of_create_is_available_beside_every_pool():
     assert create_env.NO_OP not in phases["test"][0] and phases["test"][1] == 50
 
 
-def test_evaluation_plays_the_same_number_of_episodes_in_every_environment():
+def test_evaluation_plays_the_same_number_of_episodes_in_every_environment(monkeypatch):
     args = replace(ppo.default_args("gridworld"), representation="engineered", one_hot=False)
     phases, train_ids = ppo.action_phases(args)
     envs, _ = ppo.make_envs(args, phases["test"], 1, (0,))
     agent = ppo.Agent(envs, ppo.load_table(args), train_ids, args)
     result = ppo.evaluate(agent, phases["test"], 1000, (0, 3))
     # An untrained policy is the uniform one: 0.3 % success, 4.9 skills an episode (exact values).
-    assert result["score"] < 0.02 and abs(result["length"] - 4.92) < 0.35
+    assert result["score"] < result["return"] < 0.03 and abs(result["length"] - 4.92) < 0.35
+    count = lambda played: (np.bincount([n for n, *_ in played]).tolist(), 0.0, 0.0)  # noqa: E731
+    monkeypatch.setattr(ppo, "episode_means", count)
+    counts = ppo.evaluate(agent, phases["test"], 50, (0, 3))["score"]
+    assert counts == [2] * 10 + [1] * 30
 
 
 def test_evaluate_appends_a_row_and_makes_a_gif(finished, tmp_path, capsys):
@@ -676,6 +729,7 @@ def test_adaptation_is_to_the_whole_test_set_from_scratch_or_from_a_run(tmp_path
 # ---- torchrun ----
 JOINT = """import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
 import atexit, pathlib, ppo_actiongen as ppo, test_ppo_actiongen as test; ppo.join_processes()
+ppo.MAX_GRAD_NORM = 1e9
 test.torch.save(test.joint_update(ppo.RANK, ppo.WORLD_SIZE), {folder!r} + f"/{{ppo.RANK}}")
 ppo.dist.barrier(); atexit._run_exitfuncs(); test.time.sleep(1)  # no thread outlives it
 assert not any("gloo" in p.read_text() for p in pathlib.Path("/proc/self/task").glob("*/comm"))
@@ -693,13 +747,21 @@ def joint_update(rank, world, passes=2):
     flat = dict(state=state, available=sets, logprob=logprob, value=value) | action
     flat |= {"advantage": 3 + torch.randn(T * N), "return": torch.randn(T * N)}
     batch = {k: v.detach().unflatten(0, (T, N))[:, mine] for k, v in flat.items()}
-    ppo.update(agent, torch.optim.Adam(agent.parameters(), 1e-3, eps=1e-5), batch, 0.01)
+    ppo.update(agent, torch.optim.SGD(agent.parameters(), 0.1), batch, 0.01)
     stats = ppo.RunningMeanStd((7,))
     stats.update(batch["state"].flatten(0, 1))
     return [start, torch.cat([p.detach().flatten() for p in agent.parameters()]), stats.sums]
 
 
-def test_two_processes_learn_what_one_learns_from_the_joint_batch(tmp_path):
+def test_advantages_are_normalised(monkeypatch):
+    seen, loss = [], ppo.ppo_loss
+    monkeypatch.setattr(ppo, "ppo_loss", lambda *a: seen.append(a[1]["advantage"]) or loss(*a))
+    joint_update(0, 1)
+    assert len(seen) == 3 and all(abs(x.mean()) < 1e-5 and abs(x.std() - 1) < 1e-3 for x in seen)
+
+
+def test_two_processes_learn_what_one_learns_from_the_joint_batch(tmp_path, monkeypatch):
+    monkeypatch.setattr(ppo, "MAX_GRAD_NORM", 1e9)  # it would hide a factor
     script = tmp_path / "joint.py"
     script.write_text(JOINT.format(root=str(ROOT), folder=str(tmp_path)))
     run(*TORCHRUN, script)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import recsys
-from recsys import GONE, ORGANIC, RecSysEnv
+from recsys import GONE, RecSysEnv
 
 SPLIT = recsys.split_actions()
 TEST = SPLIT["test"]
@@ -129,46 +129,6 @@ def test_the_environment_equals_the_plain_rules_draw_by_draw(seed, data):
 def test_a_draw_of_exactly_zero_never_reaches_an_impossible_session():
     assert [row.searchsorted(0.0, side="right") for row in recsys.CUMULATIVE] == [0, 0, GONE]
     assert np.array_equal(recsys.CUMULATIVE[:, 2], [1, 1, 1])  # nor does a draw just below 1
-
-
-def test_organic_sessions_have_their_closed_form():
-    """k ~ Geometric(0.26) draws; k perturbations add up to one, of variance 0.01 chi-squared(k)."""
-    n, env, rng = 10_000, RecSysEnv(SMALL, 5), np.random.default_rng(1)
-    env.reset(seed=0)
-    moved, views, left = np.zeros(n), np.zeros(n), np.zeros(n)
-    for i in range(n):
-        env.session, env.user, env.page_views = ORGANIC, np.zeros(16), [0]
-        env._organic_session()
-        moved[i], views[i] = np.mean(env.user**2), env.page_views[0]
-        left[i] = env.session == GONE
-    assert views.min() == 1 and views.mean() == about(1 / 0.26, views)  # 3.85
-    assert left.mean() == about(1 / 26, left)
-    closed = 0.01 * rng.chisquare(rng.geometric(0.26, n)) * rng.chisquare(16, n) / 16
-    points = np.sort(np.concatenate([moved, closed]))
-    ranks = [np.searchsorted(np.sort(sample), points, "right") / n for sample in (moved, closed)]
-    assert np.abs(ranks[0] - ranks[1]).max() < 1.63 * np.sqrt(2 / n)  # Kolmogorov-Smirnov, 1 %
-
-
-@pytest.mark.parametrize(
-    ("p", "first", "later"),
-    [  # chance to end at the first and at a later recommendation
-        (0, 1 / 26 + 25 / 26 * (0.01 + 0.05 / 26), 0.01 + 0.05 / 26),
-        (1, 1 / 26, 1 / 26),  # a click brings back who left unnoticed during the reset
-    ],
-)
-def test_leave_rates(monkeypatch, p, first, later):
-    always(monkeypatch, p)
-    env, ended = RecSysEnv(SMALL, 5), ([], [])
-    env.reset(seed=0)
-    for _ in range(2000):
-        env.reset()
-        for t in range(12):
-            *_, terminated, _, _ = env.step(0)
-            ended[t > 0].append(terminated)
-            if terminated:
-                break
-    assert np.mean(ended[0]) == about(first, ended[0])
-    assert np.mean(ended[1]) == about(later, ended[1])
 
 
 def test_time_is_up_after_100_recommendations(monkeypatch):

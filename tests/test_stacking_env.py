@@ -339,6 +339,11 @@ def test_a_shape_is_let_go_at_its_place_just_above_everything(placement, dims, m
     env.close()
 
 
+def test_the_camera_depends_on_the_placement():
+    states = [StackingEnv(placement=p).reset(seed=6)[0]["state"][3] for p in ("1d", "2d")]
+    assert not np.array_equal(*states)
+
+
 def test_bad_actions_are_refused_and_leave_no_trace(env):
     env.reset(seed=8)
     before = env.poses()
