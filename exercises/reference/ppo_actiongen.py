@@ -37,9 +37,9 @@ then what surrounds them: which actions are available, checks, the run's folder,
 
 An environment is a module (the smallest: exercises/dial.py). It shows a dictionary: the "state",
 and "available", the ids of the K actions to choose from. A step is one action of one environment. A
-*score* is one number per episode (success, click-through rate, height), in its last step's info,
-under METRIC of the module. "The encoder" is hvae.py's; f_omega(s), the *encoding* of s, is that of
-`agent.encoder`.
+*score* is one number per episode (success, click-through rate, height), in its last step's info
+under the key METRIC of the module. "The encoder" is hvae.py's; f_omega(s), the *encoding* of s, is
+that of `agent.encoder`.
 
 Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
 n training, A all actions, D numbers in a representation, H hidden units.
@@ -87,7 +87,7 @@ Distribution.set_default_validate_args(False)  # the checks cost as much as the 
 
 
 # An option of your own touches at most four places: a line in Args; the layer, if it needs one, in
-# Agent.__init__; its use, in Agent.act or ppo_loss; and, if you want to watch it, a number in the
+# Agent.__init__; its use, mostly in Agent.act or ppo_loss; and, to watch it, a number in the
 # dictionary that ppo_loss returns, which becomes a column of metrics.csv. (An option of an
 # environment: a line in Args, and its name in OPTIONS, far below.) Switched off, it must not make a
 # layer: a new layer draws random numbers, and every run would change.
@@ -185,10 +185,12 @@ TABLE_3 = {
     # As in [code]; but for Stacking 200, not 40, which cannot tell checkpoints apart [here].
     "valid_episodes": (640, 160, 640, 200),
 }
-# Where [code] has other numbers for a single method or test, Tables 3 and 4 are kept [here]: the
-# continuous baseline (T = 256), no subsampling in CREATE (six minibatches), the Recommender (50
-# available in validation; with `fully_observable` 25 in tests, and 80M steps).
-# Each column of the table, put over the defaults of Args, is the recipe of one environment.
+# Not used [here], so that all methods are compared alike, are [code]'s other numbers for single
+# methods or tests: the continuous baseline's T = 256; without subsampling in CREATE six
+# minibatches; in the Recommender 50 available in validation, with `fully_observable` 25 in tests
+# and 80M steps.
+
+# Each column of the table, put over the defaults of Args, is the recipe `paper` of an environment.
 PRESETS = {}
 for number, environment in enumerate(TABLE_3["env"]):
     PRESETS[environment] = Args(**{name: row[number] for name, row in TABLE_3.items()})
@@ -239,7 +241,7 @@ FAST = {
         eval_every=102_400,  # 40 evaluations
     ),
     "stacking": dict(
-        published_init=False,  # as in Grid World; and ending a tower starts unlikely
+        published_init=False,  # as in Grid World; and at first towers are rarely ended
         lr_decay_steps=None,  # as in CREATE
         minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
         clip_vloss=False,  # as in CREATE: heights, too, are large against clip_coef
@@ -371,11 +373,11 @@ def cnn(frames, H, small):
 
 
 def small_inverted(frames):
-    """Pictures (N, C, 84, 84) uint8, dark on white -> (N, C, 42, 42) uint8, bright on 0."""
+    """Pictures (B, frames, 84, 84), dark on white -> (B, frames, 42, 42) uint8, bright on 0."""
     # The white background becomes 0. At the start of an episode, the stack of frames is padded with
     # black ones; inverted they would be all 255, so they are set to 0.
-    is_real = frames.amax((2, 3), keepdim=True) > 0  # (N, C, 1, 1)
-    halved = F.avg_pool2d(frames.float(), 2)  # (N, C, 42, 42)
+    is_real = frames.amax((2, 3), keepdim=True) > 0  # (B, frames, 1, 1)
+    halved = F.avg_pool2d(frames.float(), 2)  # (B, frames, 42, 42)
     return ((255 - halved) * is_real).byte()
 
 
@@ -391,9 +393,9 @@ class RunningMeanStd(nn.Module):
         self.register_buffer("sums", torch.stack(prior))  # (3, *shape)
 
     def update(self, x):
-        """Add a batch (n, *shape), and those of the other processes."""
+        """Add a batch (B, *shape), and those of the other processes."""
         x = x.double()
-        new = torch.stack([torch.ones_like(x), x, x.square()]).sum(1)  # (3, n, ...) -> (3, ...)
+        new = torch.stack([torch.ones_like(x), x, x.square()]).sum(1)  # (3, B, ...) -> (3, ...)
         sum_over_all(new)
         self.sums += new
 
@@ -584,7 +586,7 @@ class Agent(nn.Module):
         # The policy is a product of up to three distributions: which action, where, and whether to
         # stop. So their log-probabilities add up. Their entropies are added up for the bonus, that
         # of the position with a weight of its own (Table 3). In C.4 every action has its own
-        # distribution of positions; only that of the chosen action counts [code].
+        # distribution of positions; only the chosen action's has its entropy added [code].
         is_new = action is None
         if is_new:
             action = {}
@@ -761,8 +763,8 @@ def update(agent, optimizer, batch, ent_coef):
     # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
     # the first step the policy is no longer the one that played, hence the ratio in ppo_loss.
     for epoch in range(agent.args.update_epochs + agent.args.head_epochs):
-        # The last head_epochs passes leave f_omega as it is (no gradient, so Adam skips it): the
-        # utility, the position's layers and the critic learn on. The reason stands in FAST.
+        # The last head_epochs passes leave f_omega as it is (no gradient, so Adam skips it): in
+        # further passes it would move the policy too far, but the layers after it need them.
         agent.encoder.requires_grad_(epoch < agent.args.update_epochs)
         parameters = [p for p in agent.parameters() if p.requires_grad]
         order = torch.randperm(len(flat["value"]), device=agent.table.device)
@@ -833,8 +835,8 @@ def train(args):
             obs, _ = envs.reset(seed=seeds(N, args.seed, TRAINING, step, RANK))
             G = torch.zeros(N, device=device)  # see running_returns
 
-        # The learning rate falls linearly (D.2), to a tenth [code]. So may the entropy bonus
-        # [here]: exploring is wanted early; late in training a random action can cost the episode.
+        # The learning rate falls linearly (D.2), in decay_steps to a tenth [code]. So may the
+        # entropy bonus [here]: it is wanted early; late in training a random action costs episodes.
         left = 1 - min(1.0, step / decay_steps)
         learning_rate = args.learning_rate * (LR_FLOOR + (1 - LR_FLOOR) * left)
         ent_coef = args.ent_coef * (args.ent_floor + (1 - args.ent_floor) * left)
@@ -842,8 +844,8 @@ def train(args):
 
         # Collect. The regulariser *subsampling* works inside of envs.step: when an episode ends,
         # its environment is reset, and `reset` (in the environment's file) draws K new actions out
-        # of the pool and shows their ids in obs["available"]. No action is sure to be there: the
-        # policy has to read representations. (--no-subsample: always the same set.)
+        # of the pool and shows their ids in obs["available"]. No action is sure to be there
+        # (but CREATE's no-op): the policy has to read representations. (--no-subsample: one set.)
         batch, obs, episodes = rollout(envs, obs, agent, rollout_size // args.num_envs)
 
         # Judge: how much better than expected did each action turn out (gae)? Unless states are
@@ -863,7 +865,7 @@ def train(args):
         # Learn. The statistics of the states are renewed only afterwards [here]: with new ones
         # every probability would change, and the ratio in ppo_loss would not start at 1. While
         # fine-tuning they stay as they were [code]: the layers that were taken over expect this
-        # scaling. (Those of the rewards, above, start anew [here].)
+        # scaling. (Those of the rewards start anew [here]: best.pt does not hold them.)
         numbers = update(agent, optimizer, batch, ent_coef)
         if not (agent.is_image or args.one_hot or args.finetune):
             agent.obs_stats.update(batch["state"].flatten(0, 1))
@@ -874,8 +876,8 @@ def train(args):
         step += rollout_size
 
         # Select. The regulariser *validation*: of all checkpoints the one is kept that does best
-        # with actions which neither encoder (but for hvae-all) nor policy was trained on; as many
-        # of them are available as in the test. Test actions do not select: the best of many noisy
+        # with actions that neither policy nor encoder (but hvae-all's) was trained on; as many of
+        # them are available as in the test. Test actions do not select: the best of many noisy
         # scores is too high by luck, so the score that is reported has to come from actions that
         # had no part in the choice.
         is_checkpoint = step % eval_steps == 0 or step == last_step
@@ -1004,7 +1006,7 @@ def with_no_op(action_pool, args):
 def make_envs(args, phase, num_envs, stream):
     """Environments for a phase, (action_pool, K available), and their first observation."""
     # make_vec gives every environment a generator of its own, seeded by `stream`, so reset needs no
-    # seed. (Training seeds them anew, with its rank, at first and after every checkpoint.) Each
+    # seed. (Training seeds them anew, with RANK, at first and after every checkpoint.) Each
     # reset draws K ids, the no-op among them.
     action_pool, K = phase
     make_vec = hvae.load_environment(args.env).make_vec
@@ -1036,10 +1038,10 @@ def action_phases(args):
     eval_K = args.eval_available or learn_K
     train_K = eval_K
     # Three cases learn with a fixed set instead, all of it available all the time, and "train"
-    # scores them on it: nearest neighbour, the ablation without subsampling, and C.2 [code] (the
-    # zero-shot score beside it: evaluate RUN, with all test actions as --num-available). Where the
-    # utilities would cost too much, fixed_set_size makes the set smaller [code]; nearest neighbour,
-    # whose outputs are cheap, keeps all of it.
+    # scores them on it: nearest neighbour, the ablation without subsampling, and C.2 [code]. (C.2
+    # is compared with zero-shot scores: evaluate the run that was not adapted, with the size of
+    # this set as --num-available.) Where the utilities would cost too much, fixed_set_size makes
+    # the set smaller [code]; nearest neighbour, whose outputs are cheap, keeps all of it.
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
@@ -1180,8 +1182,8 @@ def run_name_of(args):
 def claim_folder(args):
     """The run's folder, new or to be resumed; no other process may write there as long as we live.
 
-    UserError if another process does, if there is a checkpoint but no --resume, or if it is of
-    other options (which mostly name another folder, and so a new run).
+    UserError if another process does, if there is a checkpoint but no --resume, or if its options
+    differ (mostly they give another name, so another folder).
     """
     folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
