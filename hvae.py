@@ -157,7 +157,7 @@ EXCEPTIONS = {
         "epochs":              (0,     0,     5_000),   # Table 3
         "hidden":              (128,   128,   128),     # appendix: 64; [code] and [here] 128
         "learning_rate":       (2e-3,  2e-3,  1e-3),
-        "batch_observations":  (4,     4,     52),      # [code]; 1,024 would need 65 GB of memory
+        "batch_observations":  (4,     4,     52),      # [code]: 5 GB; 1,024: in proportion 94
         "kl_c_divisor":        (1024,  1024,  52),      # fast: as in CREATE
         "kl_warmup":           (0.5,   0.5,   0.0),
         "updates":             (1_000, 1_500, 0),
