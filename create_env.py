@@ -30,8 +30,7 @@ unit = 42 * (norm + 1). Angles are degrees counter-clockwise in the tables, radi
 A task of your own is one more entry of TASKS, for instance right after the table:
 
     TASKS["gap"] = Task(
-        target=ball("Target", -0.6, 0.6),
-        goal=star(0.7, -0.1),
+        target=ball("Target", -0.6, 0.6), goal=star(0.7, -0.1),
         items=(line(-0.5, 0.1, 34), line(0.7, -0.2, 20)),  # x, y (norm), length (units)
         shifts={"target": (0.1, 0.0)},  # at every reset its x moves by U(-0.1, 0.1), its y stays
     )
@@ -85,8 +84,7 @@ LAMBDA_OVERLAP = -0.01  # Eq. 3
 
 MIN_TOOL_GAP = 0.3  # [code] norm: tool centres this close "overlap"
 # A.3 "no moving objects" [code]: an action is still if at its end no body's centre is faster than
-# this. One still action is forgiven, because the agent may set things going again. The second ends
-# the episode, even if things moved in between: [code] never resets the count, and so it is here.
+# this. The second one ends the episode, even if things moved in between.
 STILL_SPEED = 0.05  # units/s
 STILL_ACTIONS = 2
 HIT_DISTANCE = 0.03  # [code] share of the screen's diagonal, 3.56 units: the target hit
@@ -218,6 +216,7 @@ KINDS = {
     "Goal ball": Kind("disc", GREEN, MOVING),
     "Heavy ball": Kind("disc", "#000000", MOVING),
     "Box": Kind("box", "#a87b4c", MOVING),
+    "Level see-saw": Kind("segment", WOOD, PLANK, radius=0),
     "Goal star": Kind("polygon", GREEN, GOAL, sides=5),
     "Basket": Kind("box", "#f2a98c", GOAL),
     "Subgoal": Kind("disc", "#d3feb9", GOAL),
@@ -497,10 +496,10 @@ def chamber(sign: int) -> tuple[Item, ...]:
     )
 
 
-# [code] All numbers of the levels: positions in norm, lengths and radii in units, degrees.
+# [code] All numbers: positions in norm, lengths and radii in units, degrees. The first three tasks
+# are in the main paper, the other nine in Figure 8.
 # fmt: off
 TASKS = {
-    # The first three are in the main paper, the other nine in Figure 8.
     # The marker falls at the right: bend its way, so that it knocks the target to the star.
     "push": Task(
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
@@ -522,7 +521,7 @@ TASKS = {
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9), goal=star(-0.8, -0.8),
         items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
-               item("See-saw", -0.3, -0.1, size=30, damping=1, max_angle=30, mass=1, left_up=True,
+               item("Level see-saw", -0.3, -0.1, size=30, max_angle=30, mass=1, left_up=True,
                     friction=0),
                line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20)),
         shifts={"ball": 0.05, "target": 0.1}, subgoals=((-0.1, -0.45),), walls=ROOM),
@@ -693,13 +692,19 @@ class SceneObject:
 
     def _fixtures(self, static_body: pymunk.Body) -> list:
         """What holds a plank at its pivot and limits its turn; the weight on its end, if any."""
-        # [code] has a pin joint of length zero and a slide joint, and the centre drifts. [here] the
+        # [code] has a pin joint of length zero and a slide joint, and the centre shakes. [here] the
         # joints made for this. On average over 800 launches per class balls move as in [code].
         fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
-        if self.tool.max_angle:
+        limit = radians(self.tool.max_angle)
+        tilt = start_tilt(self.tool)
+        if self.tool.kind == "Level see-saw":
+            # As in [code], or it would rest under its heavy ball and end episodes (`_ended`). A
+            # point 1 unit down the plank is kept near its place at angle 0.
+            fixtures = [pymunk.PinJoint(self.body, static_body, (0, 0), self.place)]
+            slide = (Vec2d.from_polar(-1, tilt), self.place - (1, 0), 0, 2 * sin(limit / 2))
+            fixtures.append(pymunk.SlideJoint(self.body, static_body, *slide))
+        elif limit:
             # The body's angle starts at 0, with the plank at `tilt`; limits count from there.
-            limit = radians(self.tool.max_angle)
-            tilt = start_tilt(self.tool)
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
@@ -907,7 +912,7 @@ def draw(canvas: Canvas, tool: Tool, place: Vec2d, angle: float = 0.0) -> None:
             ahead = 1 if tool.speed > 0 else -1  # an arrow head shows where it runs to
             end = ahead * half
             canvas.polygon([at(end + 2 * ahead), at(end, 1.9), at(end, -1.9)], colour)
-        case "See-saw" | "Hinged See-saw" | "Lever":
+        case "See-saw" | "Hinged See-saw" | "Level see-saw" | "Lever":
             canvas.polygon([place, place + (-2, -2), place + (2, -2)], colour)
             canvas.line(corners, 1.0, colour)
             if tool.mass:
@@ -942,8 +947,7 @@ class CreateEnv(gym.Env):
     ## Observation Space
     `state`, Box(0, 255, (3, 84, 84), uint8): grey pictures, one at the end of each of the last 3
     actions, newest last; after reset the two older ones are black. `available`, Box(0, NUM_ACTIONS
-    - 1, (K,), int64): the no-op and K - 1 tools, drawn without replacement from the pool at every
-    reset. A pool of only K - 1 tools is available as it is, sorted.
+    - 1, (K,), int64): the no-op and K - 1 tools of the pool, drawn without replacement at reset.
 
     ## Rewards
     0.01 per action; +10 for the goal; +2 for each subgoal once; -0.01 for a tool that is refused.
@@ -952,9 +956,9 @@ class CreateEnv(gym.Env):
     moved it; in obstacle and cannon the marker must also have touched it.
 
     ## Episode End
-    Terminated: goal reached; target off the screen; marker off the screen before the target hit;
-    nothing moves at the end of an action for the second time, in a row or not. Truncated: 30
-    actions (obstacle, belt 50; basket 40). On the last step `info` has `success`, 0.0 or 1.0.
+    Terminated: goal reached; target off the screen; marker off it before the target hit; nothing
+    moves at the end of an action for the second time, in a row or not. Truncated: 30 actions
+    (obstacle, belt 50; basket 40). On the last step `info` has `success`, 0.0 or 1.0.
 
     ## Arguments
     `action_pool` ids (default: training split), `num_available` K, `task` of TASKS. Without
@@ -1022,8 +1026,8 @@ class CreateEnv(gym.Env):
         for name, half_range in task.shifts.items():
             self._shifts[name] = self.np_random.uniform(np.negative(half_range), half_range, 2)
 
-        # The order is that of [code]. Contacts are solved in this order, so it is part of a level.
-        # Subgoals and walls are never shifted.
+        # Contacts are solved in this order, so it is part of a level: that of [code], but in cannon
+        # the walls come before the items there. Subgoals and walls are never shifted.
         self._space = make_space()
         self._objects = []
         self._marker = self._add(task.marker, "marker") if task.marker else None
@@ -1132,8 +1136,8 @@ class CreateEnv(gym.Env):
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
-        # Then the subgoals; a reached one disappears. [code] counts what is touched at the end of
-        # an action; [here] at any time in it, because that is the rule of the goal.
+        # Then the subgoals; a reached one disappears ([code]: from the next picture). [code] counts
+        # what is touched at the end of an action; [here] at any time in it, as the goal's rule is.
         reached = [subgoal for subgoal in self._subgoals if subgoal.touched]
         for subgoal in reached:
             self._space.remove(*subgoal.parts)
@@ -1161,10 +1165,9 @@ class CreateEnv(gym.Env):
         # appendix: three ends, below; [code], [here]: a lost ball, too (target; marker before hit).
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
-        # A.3 "no moving objects" [code]. Planks are in the list, but their centres rest on the
-        # pivot, so a turning plank counts as still. A see-saw's weight is not in it. A ball that is
-        # not needed (the marker after the hit, the heavy ball) and falls for ever below the screen
-        # counts as moving. One in a bucket rests, though gravity has just added 0.07 > STILL_SPEED.
+        # A.3 "no moving objects" [code]. A tool's plank turns about a resting centre: it is still.
+        # A ball that is not needed (marker after the hit, heavy ball) and falls for ever below the
+        # screen is not. One in a bucket is, in spite of gravity (0.07 a step).
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
             self._still += 1
@@ -1182,8 +1185,7 @@ class CreateEnv(gym.Env):
         return canvas
 
     def _observe(self) -> dict[str, np.ndarray]:
-        # A.3 State: the newest grey picture and the two before it. Copies go out, so that nothing
-        # done to an observation comes back into the next.
+        # A.3 State: the newest grey picture and the two before it. Copies go out.
         canvas = Canvas(84, in_colour=False)
         canvas.image.paste(self._background.image)
         newest = self._draw_objects(canvas, moving=True).picture()
@@ -1273,7 +1275,6 @@ def action_observations(action_ids, num_observations, modality="state", seed=0, 
         raise ValueError(f"{num_observations} observations, must be at least 1")
     shape = (len(action_ids), num_observations, PROBE_LENGTH, *shapes[modality])
     result = np.empty(shape, np.uint8 if modality == "video" else np.float32)
-
     record = partial(_record, num_observations, modality, seed)
     ids = np.asarray(action_ids).tolist()
     # In several processes or in this one. disable=None: no bar where nobody watches (a log file).
@@ -1293,8 +1294,7 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
     missing = np.arange(n)  # trajectories that are still to be recorded
     attempt = 0
     while len(missing):
-        # A ball starts anywhere and flies at the tool's centre. [code] Its speed is 12.5 * (1 + 0.4
-        # * attempt) * (1 + distance), times a random factor from 0.6 to 1.4.
+        # A ball flies from anywhere at the tool's centre, faster from afar and after misses [code].
         start = rng.uniform(-1.0, 1.0, (len(missing), 2))
         gap = places[missing] - start
         distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (missing, 1) norm

@@ -108,8 +108,8 @@ class Args:
 # ---- Tables 3 and 4 ----
 
 # Args explains the rows. "paper" has the tables' numbers (pictures, videos: see below); "fast", the
-# default, takes minutes on a CPU, more for pictures; "quick" is shorter, or the same. Counts and
-# rates of both are [here]: tried by hand, judged by `probe` (on validation and test actions).
+# default, takes minutes on a CPU, more for pictures; "quick" is shorter, or the same. Counts, rates
+# of both are [here]: tried by hand, judged by `probe` on held-out actions (D.2.1: validation's).
 # fmt: off
 HYPERPARAMETERS = {  # of Grid World and files of your own; columns: quick, fast, paper
     "representation_size": (16,    16,    16),      # Table 3
@@ -165,8 +165,8 @@ EXCEPTIONS = {
         "linear_path":         (True,  True,  False),
     },
 }
-# appendix: Table 3 has one column for all of CREATE; [code] its videos have the numbers of
-# Shape Stacking's pictures; [here] as the code.
+# appendix: Table 3 has one column for all of CREATE; [code] its videos have the numbers of Shape
+# Stacking's pictures, but 45 observations in an update; [here] as the code, but 52.
 EXCEPTIONS["video"] = EXCEPTIONS["image"] | {
         "updates":             (200,   600,   0),
         "observations":        (16,    128,   1024),    # 1,024 of every tool: 35 GB
@@ -405,7 +405,7 @@ class ObservationDecoder(nn.Module):
         # By this product the start can cancel the effect: beside a wall, a move does nothing.
         gated = effect * self.start(start)  # (B, H)
         # The LSTM's input. appendix: not said how; [code] a new product at every step, with the
-        # prediction of the step before; [here] one for all steps: the model learns sooner.
+        # prediction of the step before; [here] one for all steps: simpler, no worse in one trial.
         sequence = gated[:, None].expand(-1, self.steps, -1)  # (B, T, H)
         return self.output(self.lstm(sequence)[0])  # (B, T, F)
 
@@ -608,16 +608,16 @@ def short_hash(data):
     return hashlib.sha256(repr(data).encode()).hexdigest()[:8]  # eight hexadecimal digits
 
 
-def source_hash(module):
-    # Has the file changed in any way? Then recordings are made anew; an old table prints a note.
-    return short_hash(Path(module.__file__).read_bytes())
+def source_hash(*files):
+    # Have files changed in any way? Then recordings are made anew; an old table prints a note.
+    return short_hash([Path(file).read_bytes() for file in files])
 
 
 def observe(module, ids, args):
     """Raw observations (len(ids), N, ...), recorded once for all encoders."""
     N = args.observations
     kind = f"{environment_name(args.env)}-{args.modality}-{N}"
-    source = source_hash(module)
+    source = source_hash(module.__file__)
     path = Path(args.runs_dir) / "observations" / f"{kind}-{source}-{short_hash(ids.tolist())}.npy"
     workers = os.cpu_count() or 1
 
@@ -706,9 +706,8 @@ def train(args: Args) -> Path:
         raise UserError(f"the parts of split {args.split!r} overlap")
     # CREATE's no-op, always available, is in no part of a split, but an action like others (A.3).
     no_op = getattr(module, "NO_OP", parts[:0])  # or none
-    shown = parts if args.train_on == "all" else split["train"]
     action_pool = np.union1d(no_op, parts)
-    train_ids = np.union1d(no_op, shown)
+    train_ids = np.union1d(no_op, parts if args.train_on == "all" else split["train"])
     data = observe(module, action_pool, args)
     if args.device == "auto":
         args = replace(args, device="cuda" if torch.cuda.is_available() else "cpu")
@@ -740,10 +739,9 @@ def representation_path(args: Args) -> Path:
 
 def check_table(path, mean, module):
     """UserError unless a table has a row of finite numbers for every action."""
-    number = module.NUM_ACTIONS
-    if mean.ndim != 2 or len(mean) != number or not np.isfinite(mean).all():
+    if mean.ndim != 2 or len(mean) != module.NUM_ACTIONS or not np.isfinite(mean).all():
         raise UserError(
-            f"{path}: mean must be finite (training diverged?) and ({number}, D), got {mean.shape}"
+            f"{path}: {mean.shape}, must be ({module.NUM_ACTIONS}, D), finite (training diverged?)"
         )
 
 
@@ -761,7 +759,9 @@ def save_representation(path, mean, action_ids, config: dict) -> Path:
     module = load_environment(str(config.get("env")))  # without one: unknown environment 'None'
     mean = np.asarray(mean, np.float32)
     check_table(path, mean, module)
-    config = config | dict(action_set=action_set(module), source=source_hash(module))
+    config = config | dict(
+        action_set=action_set(module), source=source_hash(module.__file__, __file__)
+    )
     arrays = dict(mean=mean, action_ids=np.array(action_ids, int), config=json.dumps(config))
     write(path, lambda file: np.savez(file, **arrays))
     return path
@@ -785,8 +785,8 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
         if config.get(key, value) != value:  # a table that names no split belongs to every split
             raise UserError(f"{path} has {key} {config[key]!r}, wanted {value!r}: make it again")
     check_table(path, mean, module)
-    if config.get("source") != source_hash(module):
-        print(f"note: {path} was made with another version of {module.__file__}")
+    if config.get("source") != source_hash(module.__file__, __file__):
+        print(f"note: {path} is of another hvae.py or {module.__name__}.py; delete it to renew it")
     return dict(mean=mean, action_ids=action_ids, config=config)
 
 
@@ -801,7 +801,7 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
         return model.fit(mean[train_ids], y[train_ids]).score(mean[held_out_ids], y[held_out_ids])
 
     module = load_environment(env)
-    features = np.asarray(module.engineered_representations())
+    features = module.engineered_representations()
     ridge = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-4, 4, 17)))
     # Of Grid World's skills: a linear read-out of the net displacement; logistic ones of the five
     # moves, by chance 0.25; the share whose nearest training skill has the same displacement.

@@ -188,7 +188,7 @@ TABLE_3 = {
 # Not used [here], so that all methods are compared alike, are [code]'s other numbers for single
 # methods or tests: the continuous baseline's T = 256; without subsampling in CREATE six
 # minibatches; in the Recommender 50 available in validation, with `fully_observable` 25 in tests
-# and 80M steps.
+# and 80M steps; for C.2 10M steps in Grid World, 5M to 20M in CREATE.
 
 # Each column of the table, put over the defaults of Args, is the recipe `paper` of an environment.
 PRESETS = {}
@@ -1038,10 +1038,11 @@ def action_phases(args):
     eval_K = args.eval_available or learn_K
     train_K = eval_K
     # Three cases learn with a fixed set instead, all of it available all the time, and "train"
-    # scores them on it: nearest neighbour, the ablation without subsampling, and C.2 [code]. (C.2
-    # is compared with zero-shot scores: evaluate the run that was not adapted, with the size of
-    # this set as --num-available.) Where the utilities would cost too much, fixed_set_size makes
-    # the set smaller [code]; nearest neighbour, whose outputs are cheap, keeps all of it.
+    # scores them on it: nearest neighbour, the ablation without subsampling, and C.2 [code]. Where
+    # the utilities would cost too much, fixed_set_size makes the set smaller [code]; nearest
+    # neighbour, whose outputs are cheap, keeps all of it. (C.2 is compared with zero-shot scores:
+    # evaluate the run that was not adapted, with the size of this set as --num-available. A set
+    # smaller than the pool is then another one in each episode.)
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
@@ -1406,8 +1407,9 @@ def evaluate_run(options):
     args = best["args"]
     module = hvae.load_environment(args.env)
     phases, train_ids = action_phases(args)
-    # The pool and K of the run's own test, and what the options change of them. A policy that was
-    # adapted (C.2) knows one fixed set, which is called "train".
+    # The pool and K of the run's own test, and what the options change of them (A.3: "the rest of
+    # the tools"; [here] without the part that selects). A policy that was adapted (C.2) knows one
+    # fixed set, which is called "train".
     part = "train" if args.adapt else options.actions
     pool, K = phases[part]
     pool = restrict_pool(options, module, best["agent"]["table"], pool, phases["learn"][0])
