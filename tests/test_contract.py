@@ -177,9 +177,8 @@ def test_files_import_neither_torch_nor_each_other(module):
 
 
 def test_the_four_have_the_same_names_and_the_same_small_functions(module):
-    own = dict(
-        gridworld="UNITS VARIANTS", create_env="UNITS TASKS NO_OP", stacking_env="PLACEMENTS"
-    )
+    own = dict(gridworld="UNITS VARIANTS", create_env="UNITS TASKS NO_OP")
+    own["stacking_env"] = "PLACEMENTS"
     names = "METRIC SPLITS MODALITIES NUM_ACTIONS NUM_AVAILABLE " + own.get(module.__name__, "")
     assert [name for name in names.split() if not hasattr(module, name)] == []
     assert {*getattr(module, "UNITS", {})} <= {"centre", "half_width", "step"}

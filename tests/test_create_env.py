@@ -195,9 +195,8 @@ def test_free_fall():
         assert 80 - y == pytest.approx(fallen, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    "elasticity, apexes", [(0.8, (8.31, 5.30)), (1.0, (13, 13)), (1.2, (18.7, 26.9))]
-)
+@pytest.mark.parametrize("elasticity, apexes", [(0.8, (8.31, 5.30)), (1.0, (13, 13)),
+    (1.2, (18.7, 26.9))])  # fmt: skip
 def test_trampoline_apexes_scale_with_elasticity_squared(elasticity, apexes):
     space, _, ball = drop(Tool("Trampoline", elasticity, 0, 22), (42.0, 42 + 1 + 4 + 13))
     tops, rising = [], False
@@ -251,10 +250,8 @@ def test_funnel_lets_the_ball_out_at_its_nozzle_and_is_solid_from_below():
         assert math.dist(ball.body.position, funnel.corners[1]) > 3.5  # rolls off the tip
 
 
-@pytest.mark.parametrize(
-    "other, x",
-    [(None, 0), (Tool("Funnel", size=11), 42), (Tool("Cannon", angle=270, force=100), 38)],
-)
+@pytest.mark.parametrize("other, x", [(None, 0), (Tool("Funnel", size=11), 42),
+    (Tool("Cannon", angle=270, force=100), 38)])  # fmt: skip
 def test_bucket_holds_a_ball_for_good_whatever_else_touches_it(other, x):
     space, _, ball = drop(other, (42.2, 52.0), at=(x, 34.0))
     bucket = SceneObject(Tool("Bucket", angle=0, size=3), Vec2d(42, 42), space.static_body)
@@ -324,33 +321,28 @@ def test_level_shifts_stay_in_range_and_are_shared():
     assert 0.15 < np.abs(seen).max() <= 0.2 and sides == {-0.28, 0.28}
 
 
-def play_no_op(task: str, seed: int = 0) -> tuple[int, float, dict]:
-    """(length, return, last info) of an untouched episode."""
-    env, total = CreateEnv(task=task), 0.0
-    env.reset(seed=seed)
-    for length in range(1, 100):
-        _, reward, terminated, truncated, info = env.step(WAIT)
-        total += reward
-        if terminated or truncated:
-            return length, total, info
-        assert info == {}
+def wait_for_the_end(env: CreateEnv, action: dict = WAIT) -> list[float]:
+    """The rewards of an episode in which nothing is done after the first action."""
+    rewards, over = [], False
+    while not over:
+        _, reward, *ends, info = env.step(WAIT if rewards else action)
+        rewards.append(reward)
+        over = any(ends)
+        assert info == ({"success": 0.0} if over else {})
+    return rewards
 
 
 def test_untouched_balls_are_gone_after_seven_actions_and_navigate_rests_after_twelve():
     for task in ("collide", "moving", "ladder", "basket", "buckets", "cannon"):
-        assert play_no_op(task) == (7, pytest.approx(0.07), {"success": 0.0})
-    assert play_no_op("navigate")[0] == 12
+        assert wait_for_the_end(fixed_env(task)) == [pytest.approx(0.01)] * 7
+    assert len(wait_for_the_end(fixed_env("navigate"))) == 12
 
 
 def test_the_level_see_saw_shakes_so_that_an_episode_with_a_resting_target_goes_on():
-    env = fixed_env("seesaw", find_tool("Ramp", angle=0, size=22))
-    lengths = []
+    env, lengths = fixed_env("seesaw", find_tool("Ramp", angle=0, size=22)), []
     for seed in range(8):
         env.reset(seed=seed)
-        over = any(env.step({"choice": 1, "position": (0.2, 0.6)})[2:4])
-        while not over:
-            over = any(env.step(WAIT)[2:4])
-        lengths.append(env._actions)
+        lengths.append(len(wait_for_the_end(env, {"choice": 1, "position": (0.2, 0.6)})))
     assert np.median(lengths) == 30  # with firm joints 9.5
 
 
@@ -359,12 +351,10 @@ def move_ball(thing, x: float, y: float) -> None:
 
 
 def test_ball_in_the_level_bucket_is_at_rest():
-    env, over = fixed_env("buckets"), False
+    env = fixed_env("buckets")
     move_ball(env._target, c.to_units(0.05), 63.0)
-    while not over:
-        *_, over, _, info = env.step(WAIT)
+    assert len(wait_for_the_end(env)) < 30
     assert tuple(env._target.body.position) == pytest.approx((44.1, 37.8), abs=0.01)
-    assert info["success"] == 0.0 and env._actions < 30
 
 
 # ---- placing tools, rewards, ends ----
@@ -405,10 +395,8 @@ def test_outcomes_and_their_rewards():
         assert (env.placement, paid) == (outcome, pytest.approx(reward))
 
 
-@pytest.mark.parametrize(
-    "task, paid, reward",
-    [("collide", True, 10.01), ("push", True, 11.01), ("push", False, 10.01)],
-)
+@pytest.mark.parametrize("task, paid, reward", [("collide", True, 10.01), ("push", True, 11.01),
+    ("push", False, 10.01)])  # fmt: skip
 def test_goal_pays_ten_and_ends_and_in_push_the_target_hit_pays_with_it(task, paid, reward):
     env = fixed_env(task, subgoal_reward=paid)
     move_ball(env._target, *(env._goal.place + (7.0, 2.0)))
@@ -588,33 +576,39 @@ def test_five_thousand_random_steps():
     assert all(placed[kind] > 20 for kind in KINDS[1:]), placed
 
 
-# Published environment: success in % of 2,000 random episodes, mean length of 200 no-op episodes.
+# Published: success in % and mean length of 2,000 random episodes, mean length of 200 no-op ones.
 # fmt: off
 PUBLISHED = {
-    "push": (1.6, 7.2), "navigate": (0.1, 12.0), "obstacle": (0.0, 40.1), "seesaw": (0.15, 8.5),
-    "belt": (0.0, 30.0), "buckets": (0.6, 7.0), "cannon": (0.35, 7.0), "collide": (0.75, 7.0),
-    "moving": (2.5, 7.0), "ladder": (0.3, 7.0), "basket": (0.65, 7.0), "funnel": (1.9, 13.0),
+    "push": (1.6, 10.1, 7.2), "navigate": (0.1, 13.6, 12.0), "obstacle": (0.0, 35.7, 40.1),
+    "seesaw": (0.15, 14.2, 8.5), "belt": (0.0, 29.8, 30.0), "buckets": (0.6, 8.9, 7.0),
+    "cannon": (0.35, 10.1, 7.0), "collide": (0.75, 11.6, 7.0), "moving": (2.5, 10.2, 7.0),
+    "ladder": (0.3, 9.7, 7.0), "basket": (0.65, 10.2, 7.0), "funnel": (1.9, 15.3, 13.0),
 }
 # fmt: on
 
 
-@pytest.mark.parametrize(
-    "task, episodes",
-    [("push", 200), ("moving", 200)]
-    + [pytest.param(task, 2000, marks=pytest.mark.slow) for task in c.TASKS],
-)
-def test_random_success_and_no_op_length_as_published(task, episodes):
-    env = CreateEnv(task=task)
-    hits = sum(c.play_episode(env, seed)[2] for seed in range(episodes))
-    success, length = PUBLISHED[task]
+@pytest.mark.parametrize("task, episodes", [("push", 200), ("moving", 200)]
+    + [pytest.param(task, 2000, marks=pytest.mark.slow) for task in c.TASKS])  # fmt: skip
+def test_random_success_and_lengths_as_published(task, episodes):
+    env, hits, lengths, waits = CreateEnv(task=task), 0, [], []
+    for seed in range(episodes):
+        hits += c.play_episode(env, seed)[2]
+        lengths.append(env._actions)
+    for seed in range(episodes // 10):
+        env.reset(seed=seed)
+        waits.append(len(wait_for_the_end(env)))
+    success, length, wait = PUBLISHED[task]
     pooled = (hits + success * 20 + 1) / (episodes + 2002)  # published: 2,000 episodes
     error = math.sqrt(pooled * (1 - pooled) * (1 / episodes + 1 / 2000))
     assert abs(hits / episodes - success / 100) <= 3.5 * error, (hits / episodes, success, error)
-    lengths = [play_no_op(task, seed)[0] for seed in range(episodes // 10)]
-    # belt: published episodes have one action more before the limit, in 41 % of them
-    slack = 0.05 + 0.41 * (task == "belt")
-    slack += 3.5 * np.std(lengths) * math.sqrt(1 / len(lengths) + 1 / 200)
-    assert abs(np.mean(lengths) - length) <= slack
+    # Published episodes go on after the goal, and for one action after the limit (belt: 41 % end
+    # there). In navigate planks of [code], which shake, delay the end: 13.6 actions, here 12.4.
+    for found, expected, number, slack in (
+        (lengths, length, 2000, 1.4 if task == "navigate" else 0.5),
+        (waits, wait, 200, 0.46 if task == "belt" else 0.05),
+    ):
+        slack += 3.5 * np.std(found) * math.sqrt(1 / len(found) + 1 / number)
+        assert abs(np.mean(found) - expected) <= slack, (np.mean(found), expected, slack)
 
 
 # ---- the probe ball ----

@@ -577,10 +577,8 @@ def test_representations_made_by_hand_and_a_fixed_set_of_test_products():
     assert ppo.load_table(args).shape == (1024, 5)
 
 
-@pytest.mark.parametrize(
-    "name, changes",
-    [("hvae", {}), ("hvae-all", {"train_on": "all"}), ("vae", {"hierarchical": False})],
-)
+@pytest.mark.parametrize("name, changes", [("hvae", {}), ("hvae-all", {"train_on": "all"}),
+    ("vae", {"hierarchical": False})])  # fmt: skip
 def test_the_encoder_that_is_asked_for_is_trained_once(tmp_path, monkeypatch, name, changes):
     made = []
 
@@ -627,10 +625,8 @@ def test_an_environment_that_makes_results_wrong_is_refused(tmp_path, name):
 
 
 # ---- methods, evaluation, adaptation ----
-@pytest.mark.parametrize(
-    "line, K",
-    [("method nearest-neighbor", 512), ("method continuous", 50), ("no-subsample", 512)],
-)
+@pytest.mark.parametrize("line, K", [("method nearest-neighbor", 512), ("method continuous", 50),
+    ("no-subsample", 512)])  # fmt: skip
 def test_baselines_and_ablations_run_and_are_evaluated(tmp_path, line, K, capsys):
     small(tmp_path, *f"--{line}".split())
     ppo.main(["evaluate", str(tmp_path / "run"), "--actions", "train", "--episodes", "8"])

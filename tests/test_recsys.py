@@ -174,10 +174,8 @@ def episodes(policy, num_available, n, pool=TEST, seed=0):
     return np.array(scores).T
 
 
-@pytest.mark.parametrize(
-    ("policy", "ctr", "length"),
-    [("random", 0.155, 48), ("c-only", 0.297, 43), ("mu-only", 0.64, 32), ("oracle", 0.664, 32)],
-)
+@pytest.mark.parametrize("policy, ctr, length", [("random", 0.155, 48), ("c-only", 0.297, 43),
+    ("mu-only", 0.64, 32), ("oracle", 0.664, 32)])  # fmt: skip
 def test_floors_and_ceilings_on_unseen_products(policy, ctr, length):
     scores, lengths = episodes(policy, 500, 1000)
     margin = 0.01  # another draw of the products moves these numbers by so much
