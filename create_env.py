@@ -83,8 +83,8 @@ LAMBDA_INVALID = -0.01  # Eq. 3
 LAMBDA_OVERLAP = -0.01  # Eq. 3
 
 MIN_TOOL_GAP = 0.3  # [code] norm: tool centres this close "overlap"
-# A.3 "no moving objects" [code]: an action is still if at its end no body's centre is faster than
-# this. The second one ends the episode, even if things moved in between.
+# A.3 "no moving objects" [code]: an action is still if at its end no centre is faster than
+# STILL_SPEED. The second still action ends the episode, even if things moved in between.
 STILL_SPEED = 0.05  # units/s
 STILL_ACTIONS = 2
 HIT_DISTANCE = 0.03  # [code] share of the screen's diagonal, 3.56 units: the target hit
@@ -185,7 +185,7 @@ STEEL = "#4682b4"
 
 # fmt: off
 KINDS = {
-    # Never placed in a game. For the probe ball a disc of NO_OP_RADIUS; as a GOAL it does nothing.
+    # Never placed in a game. For the probe ball a disc of NO_OP_RADIUS, a sensor: only felt.
     "No-op": Kind("disc", GREEN, GOAL),
     # The tools in the order of their ids, which saved representations and runs rely on. Down to the
     # bucket they are those of the Default Split.
@@ -353,7 +353,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     disjoint. The no-op (id 0) is in none of them, because it is always available. The paper counts
     it: once in the 2,111 of the default split and in the 762 training tools of the analyses, twice
     in the 1,739 of the Full Split (in training and held out). Default and random have no balls,
-    bouncy balls, levers or belts, full has no 4- to 6-sided polygons, analysis has none of these.
+    bouncy balls, levers or belts, full has no 4- to 6-sided polygons, analysis has neither.
     A class of your own is in every split; half of its first parameter's values train (of three 2).
     """
     if split not in SPLITS:
@@ -603,8 +603,8 @@ MUZZLE = (5.0, 3.65)  # [code] units, half the unturned box: a shot starts (5 co
 # [code] Funnels and buckets are open between their last corner and their first. At tool angle 0 a
 # funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees, a bucket's at 135, 225, 315 and 45.
 LAST_CORNER = {"Funnel": 30, "Bucket": 45}
-# [code] The probe ball touches the no-op when its centre is within 0.1 sqrt(8) norm, 11.9 units. A
-# disc smaller by its radius is touched exactly then ([here] at any step). A GOAL, it is only felt.
+# [code] The probe ball touches the no-op when its centre is within 0.1 sqrt(8) norm, 11.9 units: a
+# disc smaller by the ball's radius does so ([here] at any step). A sensor (GOAL), it is only felt.
 NO_OP_RADIUS = 0.1 * sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
@@ -692,14 +692,14 @@ class SceneObject:
 
     def _fixtures(self, static_body: pymunk.Body) -> list:
         """What holds a plank at its pivot and limits its turn; the weight on its end, if any."""
-        # [code] has a pin joint of length zero and a slide joint, and the centre shakes. [here] the
-        # joints made for this. On average over 800 launches per class balls move as in [code].
+        # [code] has a pin joint of length zero and a slide joint, and a load shakes the centre.
+        # [here] pivot and limit joints: on average over 800 launches per class balls move alike.
         fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
         limit = radians(self.tool.max_angle)
         tilt = start_tilt(self.tool)
         if self.tool.kind == "Level see-saw":
-            # As in [code], or it would rest under its heavy ball and end episodes (`_ended`). A
-            # point 1 unit down the plank is kept near its place at angle 0.
+            # As in [code]: at rest under its heavy ball it would end episodes early (`_ended`). The
+            # point 1 unit left of the pivot stays within the chord of `limit` from level.
             fixtures = [pymunk.PinJoint(self.body, static_body, (0, 0), self.place)]
             slide = (Vec2d.from_polar(-1, tilt), self.place - (1, 0), 0, 2 * sin(limit / 2))
             fixtures.append(pymunk.SlideJoint(self.body, static_body, *slide))
@@ -708,7 +708,7 @@ class SceneObject:
             bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
             fixtures.append(bound)
         if self.tool.mass:
-            # [code] Nothing hits it: no shape. The GearJoint turns it with the plank, as there.
+            # [code] Without a shape, nothing hits it. The GearJoint makes it turn with the plank.
             weight = pymunk.Body(self.tool.mass, self.tool.mass)  # mass, moment of inertia [code]
             weight.position = self.place + weight_place(self.tool)
             pivot = pymunk.PivotJoint(self.body, weight, weight.position)
@@ -1026,8 +1026,8 @@ class CreateEnv(gym.Env):
         for name, half_range in task.shifts.items():
             self._shifts[name] = self.np_random.uniform(np.negative(half_range), half_range, 2)
 
-        # Contacts are solved in this order, so it is part of a level: that of [code], but in cannon
-        # the walls come before the items there. Subgoals and walls are never shifted.
+        # Contacts are solved in the order of adding, so it is part of a level. It is [code]'s, but
+        # in cannon [code] adds the walls before the items. Subgoals and walls are never shifted.
         self._space = make_space()
         self._objects = []
         self._marker = self._add(task.marker, "marker") if task.marker else None
@@ -1122,8 +1122,8 @@ class CreateEnv(gym.Env):
 
     def _judge(self) -> tuple[bool, int, bool]:
         """What this action achieved: (goal reached, subgoals reached, target hit just now)."""
-        # First ([code]: last) the target hit: the target is far from its start, and the marker has
-        # touched it if the task asks for that. [code] Off the screen it counts as at the edge.
+        # First ([code]: last; its goal waits an action) the target hit: far from its start and, if
+        # the task asks, touched by the marker. [code] Off the screen it counts as at the edge.
         hit_now = False
         if not self._target_hit:
             place = np.clip(self._target.body.position, 0.0, WORLD)
@@ -1132,12 +1132,12 @@ class CreateEnv(gym.Env):
             self._target_hit = hit_now
 
         # Then the goal. In obstacle and cannon a fan can bring the target there before the marker
-        # touches it. [code] pays for that at the hit; [here] not if it was in an earlier action.
+        # touches it. [code] remembers that until the hit; [here] it is forgotten after the action.
         self._goal_hit = self._target_hit and self._goal.touched
         self._goal.touched = False
 
-        # Then the subgoals; a reached one disappears ([code]: from the next picture). [code] counts
-        # what is touched at the end of an action; [here] at any time in it, as the goal's rule is.
+        # Then the subgoals; a reached one is gone from this picture on ([code]: the next). [code]
+        # counts what is touched at the end of an action; [here] at any time in it, as for the goal.
         reached = [subgoal for subgoal in self._subgoals if subgoal.touched]
         for subgoal in reached:
             self._space.remove(*subgoal.parts)
@@ -1162,12 +1162,12 @@ class CreateEnv(gym.Env):
 
     def _ended(self) -> tuple[bool, bool]:
         """(terminated, truncated) after this action."""
-        # appendix: three ends, below; [code], [here]: a lost ball, too (target; marker before hit).
+        # appendix: three ends; [code] a lost ball, too; [here] as [code] (marker: until the hit).
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
-        # A.3 "no moving objects" [code]. A tool's plank turns about a resting centre: it is still.
-        # A ball that is not needed (marker after the hit, heavy ball) and falls for ever below the
-        # screen is not. One in a bucket is, in spite of gravity (0.07 a step).
+        # A.3 "no moving objects" [code], by the speed of centres. A tool's plank only turns: still.
+        # A ball not needed that falls for ever (marker after the hit, heavy ball): moving. One in a
+        # bucket is left out: gravity alone gives it 0.07 units/s in a step.
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
             self._still += 1
@@ -1249,8 +1249,8 @@ PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; 
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
 # For hvae.py: it turns a first state into (x - centre) / half_width, so leaves it as it is, and
-# divides differences between states by step. [here] step is 4 pixels, 4 / 42 norm: the decoder's
-# smallest standard deviation, exp(-2) = 0.135 steps, is half a pixel, all that a video shows.
+# divides differences between states by step. [here] step is 4 units, 4 / 42 norm: the decoder's
+# smallest standard deviation, exp(-2) = 0.135 steps, is half a unit, a pixel of the observation.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1286,7 +1286,7 @@ def action_observations(action_ids, num_observations, modality="state", seed=0, 
 
 
 def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
-    """All observations of one tool: launch n balls, then again those that missed."""
+    """All observations of one tool: launch n balls; again those that missed or began inside."""
     tool = TOOLS[action]
     rng = np.random.default_rng([seed, action])
     places = rng.uniform(-PROBE_AREA, PROBE_AREA, (n, 2))  # norm, of the tool in each trajectory
@@ -1294,7 +1294,7 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
     missing = np.arange(n)  # trajectories that are still to be recorded
     attempt = 0
     while len(missing):
-        # A ball flies from anywhere at the tool's centre, faster from afar and after misses [code].
+        # From anywhere a ball flies towards the tool, faster from afar and after misses [code].
         start = rng.uniform(-1.0, 1.0, (len(missing), 2))
         gap = places[missing] - start
         distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (missing, 1) norm
@@ -1309,7 +1309,7 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
         done = (contact > 0) & (hit | (attempt >= PROBE_ATTEMPTS - 1))
 
         # Keep 7 of 9 states, starting 3 before the touch, clipped to a start of 0..2; after a miss
-        # start at 1. So the touch is in the middle, but for very early and late ones.
+        # start at 1. So the touch is in the middle, except for very early and very late ones.
         touch = (contact[done] - 1) // PROBE_EVERY  # the first state recorded at the touch or later
         first = np.where(hit[done], np.clip(touch - 3, 0, 2), 1)
         columns = first[:, None] + np.arange(PROBE_LENGTH)  # (done, 7)
@@ -1331,7 +1331,7 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
     offsets = CELL * np.stack(np.divmod(np.arange(m), ceil(sqrt(m))), axis=1)  # (m, 2) units
     space = make_space()
 
-    # A rule for a ball and anything; it runs beside the rules of `make_space`.
+    # A rule for a ball and whatever it touches; the rules of `make_space` act as well.
     def on_touch(arbiter, space, data) -> None:
         arbiter.shapes[0].owner.touched = True
 

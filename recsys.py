@@ -18,12 +18,12 @@ The numbers are probabilities of the next session. It is drawn after every recom
 every page viewed in an organic session; each draw also moves the user vector a little. After 100
 recommendations the episode ends, too.
 
-    python recsys.py                    # one episode as text and GIF, the click curve (8 s)
+    python recsys.py                    # an episode (text, GIF), click curve, a rough table (8 s)
     python recsys.py --policy oracle --part train --num-available 50 --seed 3
     python recsys.py --episodes 10000   # what simple policies reach, as quoted at POLICIES (3 min)
 
-The sections bear A.2's names, in another order. Two marks: [code] is the authors' released
-implementation, used where the appendix is silent; [here] is this repository's choice, with reason.
+The sections bear A.2's names, in another order. [code] is what the authors' released implementation
+does, mostly followed where the appendix is silent; [here] is this repository's choice, with reason.
 """
 
 import io
@@ -65,17 +65,17 @@ TRANSITIONS = np.array(
 CUMULATIVE = TRANSITIONS.cumsum(1)  # (3, 3), for drawing the next session
 
 # ---- A.2 Actions and action set split ----
-# Products are the same in every run. The letters of "products", as numbers, are part of the seed:
-# no environment draws the same random numbers for its users.
-# [here] 21 is the first number with which the mean mu_i of training, validation and test products
-# of split seed 0 all lie within 0.03 of 0, so that scores of the parts can be compared. Other split
-# seeds are not balanced.
+# Products are the same in every run. Their seed begins with the letters of "products", as numbers,
+# so they share no random numbers with an environment, whose seed is one number.
+# [here] 21 is the first number for which the mean of mu_i over the training, the validation and the
+# test products (split seed 0) lies within 0.03 of 0, so that scores of the parts can be compared.
+# Other split seeds are not balanced.
 _rng = np.random.default_rng([*b"products", 21])
 PRODUCTS = _rng.standard_normal((NUM_ACTIONS, DIM))  # c_i
 
 # appendix: c ~ N(0, I), of length about 4; [code] scaled to length 1, and so [here]. For a user v,
 # call c_i . v the *taste* for product i, and mu_i its *popularity*. With length 4, taste (std 4)
-# would outweigh popularity (std 3), and little would be hidden; with length 1 its std starts at 1.
+# would outweigh popularity (std 3), and little would be hidden; with 1, taste has std 1 at first.
 PRODUCTS /= np.linalg.norm(PRODUCTS, axis=1, keepdims=True)
 POPULARITY = _rng.normal(0.0, MU_STD, NUM_ACTIONS)  # mu_i, hidden from the agent
 
@@ -98,7 +98,7 @@ def engineered_representations(fully_observable: bool = False) -> np.ndarray:
 
 
 def action_observations(action_ids, num_observations, modality, seed=0, workers=1):
-    """ValueError: products come with engineered vectors (A.2). Here only for the same interface."""
+    """Always ValueError: products have engineered vectors (A.2). Every environment has this."""
     raise ValueError("recsys has no action observations; use engineered_representations()")
 
 
@@ -159,9 +159,9 @@ class RecSysEnv(gym.Env):
     uniformly from `action_pool` without replacement, and sorted.
 
     ## Episode End
-    `terminated` when the user leaves, at once or from the organic session that follows: after a
-    click with probability 0.01 / (0.25 + 0.01) = 0.0385, else 0.01 + 0.05 * 0.0385 = 0.0119. Who
-    leaves before the first recommendation still gets that one, and a click brings them back.
+    `terminated` when the user leaves, at once or from an organic session (0.01 / (0.25 + 0.01) =
+    0.0385 of these end so): with probability 0.0385 after a click, else 0.01 + 0.05 * 0.0385 =
+    0.0119. A user gone before the first step still gets it, and a click brings them back.
     `truncated` after 100. The last info holds `ctr`: clicks / recommendations, the mean reward.
 
     ## Arguments
@@ -245,8 +245,8 @@ class RecSysEnv(gym.Env):
         self._organic_session()
 
         # End (A.2): the user left, or the limit. [here] the limit is `truncated`, gymnasium's word
-        # for an end that only a clock makes; [code] does not tell the two apart, nor does
-        # ppo_actiongen.py: it bootstraps after neither.
+        # for an end that only a clock makes. Learning ignores the difference: [code] and
+        # ppo_actiongen.py bootstrap after neither.
         terminated = self.session == GONE
         truncated = not terminated and len(self.clicks) == MAX_RECOMMENDATIONS
         info = {}
@@ -299,8 +299,8 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
     """A SyncVectorEnv of RecSysEnv(action_pool, num_available, **options), seeded already.
 
     SAME_STEP: the step that ends an episode returns the first observation of the next one, and
-    infos["final_info"] holds `ctr`. Call `envs.reset()`; a seed given to it would replace
-    `seed`. ValueError as in RecSysEnv.
+    infos["final_info"] holds `ctr`. Call `envs.reset()` for the first observations; a seed
+    given to it would replace `seed`. ValueError as in RecSysEnv.
     """
 
     def make_env():
@@ -315,9 +315,9 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 # ---- floors and ceilings: what simple policies reach, to compare a trained one with ----
 # Each policy scores the available products, (K,), from taste c.v (K,) and popularity mu (K,); the
-# best is recommended. random is the floor. c-only knows c and v, not mu: the ceiling for unseen
-# products while mu is hidden, since c says nothing about mu (for a policy that remembers no
-# clicks). The oracle knows mu, too, and always recommends the likeliest click; it does not plan
+# best is recommended. random is the floor. c-only knows c and v, not mu: while mu is hidden, and
+# c says nothing about it, the ceiling on unseen products (of a policy that remembers no clicks).
+# mu-only ignores the user. The oracle recommends the likeliest click; it does not plan
 # ahead. The numbers are the CTR with 500 available test products (10,000 episodes, this script's
 # default seed, 5; standard errors up to 0.002).
 POLICIES = {
@@ -349,7 +349,7 @@ def reference_ctr(policy, pool, num_available, episodes, seed=0) -> tuple:
     """The metric of the paper, the mean of the episodes' CTR, and its standard error."""
     env = RecSysEnv(pool, num_available)
     env.reset(seed=seed)
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng([seed, 1])  # for "random": not the environment's numbers
     # [code]: an unweighted mean, so a short episode counts as much as a long one.
     ctr = [play(env, policy, rng) for _ in range(episodes)]
     return np.mean(ctr), np.std(ctr) / np.sqrt(episodes)
@@ -425,7 +425,7 @@ def draw_episode(env: RecSysEnv, shown: int) -> np.ndarray:
 
 
 def draw_click_curve(path: Path, available: np.ndarray, seed: int):
-    """A PNG for one user. Left: Eq. 2. Right: the available products. On both, four picks."""
+    """A PNG for a new user. Left: Eq. 2. Right: the products. On both, what each policy picks."""
     os.environ.pop("MPLBACKEND", None)  # see draw_episode
     from matplotlib.figure import Figure
 
@@ -440,7 +440,7 @@ def draw_click_curve(path: Path, available: np.ndarray, seed: int):
 
     figure = Figure((13, 5.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
-    left.hist(x, 40, density=True, color="#dcdcdc", label="products")
+    left.hist(x, 40, density=True, color="#dcdcdc", label="products (density)")
     left.plot(curve, click_probability(curve), color="black")
     dots = right.scatter(taste, mu, c=p)
     figure.colorbar(dots, label="click probability")
@@ -490,7 +490,7 @@ def main(args: Args) -> None:
     pool = split_actions()[args.part]
     try:
         env = RecSysEnv(pool, args.num_available, "rgb_array")
-        rng = np.random.default_rng([args.seed, 1])
+        rng = np.random.default_rng([args.seed, 1])  # a negative seed: ValueError
         if args.episodes < 1:
             raise ValueError("--episodes must be at least 1")
     except ValueError as error:

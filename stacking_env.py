@@ -95,11 +95,11 @@ MASS = 1.0
 # the class of a shape still decides what can stand on it. CONTACT holds the values of one body.
 # Bullet makes those of a pair: 1 x 1, .05 + .05 and .025 + .025. [code] Nothing bounces.
 CONTACT = dict(lateralFriction=1.0, spinningFriction=0.05, rollingFriction=0.025, restitution=0)
-# A.4 always simulates 300 steps; [here] only until all is at rest. This is not only a saving but a
-# part of the task: in the steps that are left out, small errors of the solver would shear a tower
-# apart that already stands. `greedy_plan` builds 5.3 high on average this way, and 4.7 with all
-# 300 steps; random play is as high either way. At rest means: at two checks in a row, five steps
-# apart, every velocity is below REST_SPEED, and no two bodies overlap by REST_DEPTH or more.
+# A.4 always simulates 300 steps; [here] only until all is at rest. This saves time, and it changes
+# the task: in the steps that are left out, small errors of the solver would shear a tower apart
+# that already stands. The scripted `greedy_plan` (below) builds 5.3 m on average this way, 4.7 with
+# all 300 steps; random play is as high either way. At rest means: at two checks in a row, five
+# steps apart, every velocity is below REST_SPEED, and no two bodies overlap by REST_DEPTH or more.
 CHECK_EVERY = 5  # simulation steps
 CHECKS_IN_A_ROW = 2
 REST_SPEED = 0.05  # m/s, and rad/s for angular velocities; of each component
@@ -149,7 +149,7 @@ class Family:
     A class of A.4 consists of one or more of these families; families are [code]'s unit. What
     collides is, by `bullet_type`: the convex hull of `points` (MESH), boxes of eight points each,
     or a sphere, capsule or cylinder, which Bullet computes exactly; there `points` only sample
-    the surface, for drawing and for `top`.
+    the surface, for drawing, `top` and `_drop`.
     """
 
     name: str  # [code]
@@ -159,7 +159,7 @@ class Family:
     turn: float = 0  # degrees: `num_angles` equally spaced angles in [0, turn)
     label: str = ""  # its class in Table 2, where that is not the name
     bullet_type: int = p.GEOM_MESH
-    moments: tuple = ()  # of inertia about x, y, z at scale 1 and mass 1, if computed exactly
+    moments: tuple = ()  # of inertia about x, y, z, scale 1, mass 1; () for flat sides
     same_as: str = ""  # the family that has the same solid, on another face or as a plain copy
 
     def parts(self) -> np.ndarray:
@@ -170,7 +170,7 @@ class Family:
 
 # [code] A dome is half a cylinder that lies: half a circle in x and z, its flat side at z = -.5.
 HALF_CIRCLE = [(math.cos(a), math.sin(a) - 0.5) for a in np.linspace(0, math.pi, 13)]
-# A hat is a right-angled prism on its longest side; x and y swap, so that its ridge is along x. It
+# A hat is `triangle`'s prism on its longest side; x and y swap, so that its ridge is along x. It
 # is scaled by sqrt 2, so that its short sides are 2 long, as those of `triangle`: one solid.
 HAT = prism((-1, 0), (1, 0), (0, 1))[:, [1, 0, 2]] * (1, math.sqrt(2), math.sqrt(2))
 CONE = np.vstack([ring(20, -1), (0, 0, 1)])
@@ -192,7 +192,7 @@ CYLINDER = np.vstack([ring(32, 1), ring(32, -1)])
 # different. Cube and pyramid repeat after 90 degrees, of which [code] uses only the first 45; kept.
 # [code] has two cone meshes; here one, twice, for the count of 810. Table 2 has two classes more
 # than A.4, angled-triangle and angled-rectangle, and does not say what they are. In [code] they are
-# the families `middle_triangle`, `hat` and `horizontal_rectangle`, all among its unseen shapes.
+# the families `middle_triangle`, `hat` and `horizontal_rectangle`, unseen in its Full Split.
 # The moments of a capsule: its tube (3/5 of the mass) and half a ball at each end.
 FAMILIES = (
     Family("middle_triangle", points=prism((-1, -1), (1, -1), (0, 1)),
@@ -280,9 +280,9 @@ def mass_properties(family: Family) -> tuple:
     m = np.einsum("t,tvi,tvj->ij", shares, corners, corners)
     m = (m + np.einsum("t,ti,tj->ij", shares, total, total)) / 20
     inertia = np.trace(m) * np.eye(3) - m  # (3, 3)
-    # Bullet wants the principal axes, about which this matrix is diagonal: x, y and z, except for
-    # `triangle` and `tall_triangle`. Returned is a Rotation from the body's frame, which lies along
-    # these axes, to the shape's own frame.
+    # Bullet wants the principal axes, in which this matrix is diagonal. They are the shape's x, y
+    # and z, except for `triangle` and `tall_triangle`. The Rotation that is returned leads from
+    # the body's frame, which lies along the principal axes, to the shape's own.
     diagonal = np.diag(inertia)
     if np.allclose(inertia, np.diag(diagonal), atol=1e-9):
         return com, Rotation.identity(), diagonal
@@ -310,7 +310,7 @@ def action_labels() -> np.ndarray:
 
 
 def engineered_representations() -> np.ndarray:
-    """Ground truth: scale, sin and cos of the angle, one-hot family; (NUM_ACTIONS, 19) float32."""
+    """In place of an encoder's: scale, sin, cos of the angle, one-hot family; (810, 19) float32."""
     # [code] gives the angle itself (and an axis, always vertical); [here] a point on the circle, so
     # that 350 degrees is close to 0. Angles stop before the form repeats, so no form appears twice
     # within a family. Known flaw, as in [code]: a box at 162 degrees looks much like one at 0, but
@@ -337,10 +337,10 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
     # training shape of its family; all angles of a scale stay together. [code] draws per family;
     # [here] one draw decides for a solid (form and size) in all families that have it: else a cone
-    # would be in training and its copy, the other cone, in the test. For each family: what earlier
-    # ones have decided, for training or against it, stays. Of its other solids so many are drawn
-    # that half of all its solids are in training: `cone-hires` draws half of its solids, so `cone`
-    # finds all of its own decided; `rectangle` shares one with `horizontal_rectangle`.
+    # would be in training and its copy, the other cone, in the test. What earlier
+    # families decided stays; of a family's other solids as many are drawn as bring half of it into
+    # training. So `cone-hires` draws half of its solids, and `cone` finds all of its own decided;
+    # `rectangle` shares one with `horizontal_rectangle`.
     decided = set()
     train_solids = set()
     for family in FAMILIES:
@@ -360,9 +360,9 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
-    # A.4: "randomly splitting the test set into half". Shapes of one solid and angle (the two
-    # cones, but a hat and a triangle, too) stay together. These groups are dealt in random order:
-    # to validation while they fit into its half, else to the test.
+    # A.4: "randomly splitting the test set into half". The two cones are copies and must not be on
+    # both sides: shapes of one solid and angle form a group (so do some hats and triangles). Groups
+    # in random order go to validation where they still fit into its half, else to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
     for shape_id in unseen:
@@ -393,7 +393,7 @@ class Bullet:
 @functools.cache
 def geometry(family: Family) -> tuple:
     """What Bullet gets of a family, at scale 1: its V corners, and T triangles for the pictures."""
-    # pybullet never gives back its reference to a list of vertices. The same list again costs
+    # pybullet never releases its reference to a list of vertices. The same list again costs
     # nothing, but new lists would leak 200 kB and more per episode. So the lists of a family are
     # made once, and `meshScale` gives the size.
     vertices = []
@@ -609,7 +609,7 @@ class StackingEnv(gym.Env):
         self._frames = []
         self._stack = np.zeros((FRAMES, SIZE, SIZE), dtype=np.uint8)  # black before the first one
 
-        # Two cylinders are dropped on it, "of random heights" (A.4): one height for both [code].
+        # Two cylinders fall on the table, "of random heights" (A.4): one height for both [code].
         cylinder = rng.choice(CYLINDERS)
         centre = rng.uniform(*CENTRE)
         gap = rng.uniform(*AXIS_GAP)
@@ -641,9 +641,9 @@ class StackingEnv(gym.Env):
         shape_id = self.available[choice]
         inside = (np.abs(position) <= 1).all()
 
-        # Drop the shape and wait until the scene has settled ([code]: without a new one as well).
-        # Coordinates that the agent does not decide are 0, the table's centre (C.6). [code] What
-        # still moves after 300 steps is halted first; it makes no measurable difference.
+        # Drop the shape and wait until the scene has settled. ([code] also waits when nothing was
+        # dropped.) Coordinates that the agent does not decide are 0, the table's centre (C.6).
+        # [code] What still moves after 300 steps is halted first; no measurable difference.
         if inside and shape_id not in self.shape_ids[2:] and not stop:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
@@ -653,8 +653,8 @@ class StackingEnv(gym.Env):
             self._settle()
 
         # The episode ends where the agent says so, and after ten actions. [here] the limit is
-        # `truncated`, gymnasium's word for an end that only a clock makes; [code] does not
-        # tell the two apart, nor does ppo_actiongen.py: it bootstraps after neither.
+        # `truncated`, gymnasium's word for an end that only a clock makes. Learning ignores
+        # the difference: [code] and ppo_actiongen.py bootstrap after neither.
         terminated = bool(stop)
         truncated = not terminated and self._steps >= MAX_STEPS
         self._over = terminated or truncated
@@ -674,7 +674,7 @@ class StackingEnv(gym.Env):
     def _drop(self, shape_id: int, x: float, y: float, top: float, rgb: tuple) -> None:
         """Let a shape go with its origin over (x, y) and its lowest point just above `top`."""
         # A.4: "calculated over the topmost shape, enabling a soft drop". [code] adds the radii of
-        # bounding spheres, and a flat slab falls by a metre; [here] the gap is exact.
+        # bounding spheres, and a flat slab falls by a metre; [here] exact, see `top`.
         family, scale, _ = SHAPES[shape_id]
         z = top + DROP_GAP - scale * family.points[:, 2].min()
         self._bodies.append(add_shape(self._bullet, shape_id, (x, y, z), rgb))
@@ -765,7 +765,7 @@ def make_vec(
     seed: int = 0,
     **options: Any,
 ) -> gym.vector.VectorEnv:
-    """`num_envs` environments in a process each, with independent streams; see StackingEnv."""
+    """`num_envs` environments, each in its own process, with its own seed; see StackingEnv."""
     # Processes, because the physics of a step takes 8 ms. SAME_STEP, because then no step is lost
     # between two episodes; what the ended one said last is in `final_obs` and `final_info`.
     make = functools.partial(StackingEnv, action_pool, num_available, **options)
@@ -782,9 +782,9 @@ def _views(shape_id: int, num_views: int, seed: int) -> np.ndarray:
     bullet = Bullet()
     add_shape(bullet, shape_id, (0, 0, 0), COLOURS[shape_id])
     # Each shape has its own generator, and each view takes two numbers from it: view k depends only
-    # on the seed, the shape and k. The camera goes all the way round [code], the light with it. To
-    # turn the shape is then to start elsewhere on the circle: the pictures tell its form and size,
-    # not its angle, which the policy sees only once the shape stands in the scene.
+    # on the seed, the shape and k. The camera goes all the way round [code], the light with it, so
+    # turning the shape only shifts it along its circle: the pictures tell form and size, not the
+    # angle, which the policy sees only once the shape stands in the scene.
     rng = np.random.default_rng([seed, shape_id])
     pictures = []
     for _ in range(num_views):
@@ -870,7 +870,7 @@ def greedy_plan(available: Sequence[int]) -> list[int]:
     """Positions in `available` of at most ten shapes, in order, for a high tower.
 
     The shapes with flat top and bottom, largest first, then the tallest of the rest. If all are
-    dropped over one cylinder, the mean is 5.1 to 5.4, by the split; of random play 1.5 to 1.6.
+    dropped over one cylinder, the mean is 5.1 to 5.4 m, by the split; random play: 1.5 to 1.6.
     """
 
     def rank(k):  # what is smaller comes first

@@ -15,11 +15,11 @@ understand a skill from recordings of it in another, larger and empty grid.
     #...~..G#     e.g. skill DDRRR, then RRRDD, then DDDDD: subgoal at move 5, goal at move 12
     #########
 
-    python gridworld.py       # two episodes, layouts, skills: text, and pictures in runs/demo (5 s)
+    python gridworld.py       # two episodes as text and GIFs; a PNG of layouts and skills (5 s)
     python gridworld.py --part train --num-available 10 --seed 3
 
-The sections bear A.1's names, in another order. Two marks: [code] is the authors' released
-implementation, used where the appendix is silent; [here] is this repository's choice, with reason.
+The sections bear A.1's names, in another order. [code] is what the authors' released implementation
+does, mostly followed where the appendix is silent; [here] is this repository's choice, with reason.
 """
 
 import heapq
@@ -48,7 +48,7 @@ LAMBDA_GOAL = 0.9  # Eq. 1
 # Read by the other files. In each tuple the first entry is the default.
 METRIC = "success"  # 1.0 when the episode ended on the goal, else 0.0
 SPLITS = ("default",)  # A.1
-MODALITIES = ("xy", "onehot")  # B: forms of a recording, cells (x, y) or one-hot vectors
+MODALITIES = ("xy", "onehot")  # appendix B: forms of a recording, (x, y) or one-hot vectors
 VARIANTS = ("12d", "5d")  # of the engineered representations
 
 SIZE = 9  # A.1; the outer ring is wall [code], so the agent walks on 7x7 cells
@@ -71,7 +71,7 @@ SKILL_NAMES = ["".join(MOVE_NAMES[move] for move in moves) for moves in SKILL_MO
 
 def action_labels() -> np.ndarray:
     """The quadrant each skill leads to (the colours of Fig. 4): str (1024,), 256 of each."""
-    # With five moves, no skill ends where it began. Ties [code]: straight up counts as upper left,
+    # No skill ends where it began: five is odd. Ties [code]: straight up counts as upper left,
     # straight left as lower left, straight down as lower right, straight right as upper right.
     east, south = MOVE_DELTAS[SKILL_MOVES].sum(1).T  # (1024,) each: net displacement
     labels = np.full(NUM_ACTIONS, "upper right")
@@ -100,7 +100,7 @@ def engineered_representations(variant: str = "12d") -> np.ndarray:
 
 
 def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray]:
-    """512 "train", 256 "valid", 256 "test" ids, random (A.1), sorted; ValueError if unknown."""
+    """Random ids (A.1), sorted: 512 "train", 256 "valid", 256 "test". ValueError: other splits."""
     if split not in SPLITS:
         raise ValueError(f"split {split!r} is unknown; Grid World has only 'default'")
     order = np.random.default_rng(seed).permutation(NUM_ACTIONS)
@@ -210,7 +210,7 @@ class GridWorldEnv(gym.Env):
         """Draw a layout and the available skills; returns (observation, {})."""
         super().reset(seed=seed)
         # A.1: "a randomly placed lava wall". It is drawn even when `options` name a layout, so that
-        # the skills drawn next are the same in every layout.
+        # a seed draws the same skills whatever the layout.
         drawn = self.np_random.integers(len(LAYOUTS))
         layout = (options or {}).get("layout", drawn)
         if layout not in range(len(LAYOUTS)):
@@ -220,8 +220,8 @@ class GridWorldEnv(gym.Env):
 
         # Every episode has its own random subset of the pool: the paper's *subsampling*. [code]
         # draws it from the system's entropy; [here] the seeded generator, so a run can be repeated.
-        # The order is random, too, since the policy scores each skill by itself. Only a whole pool
-        # is sorted: then a policy with one output per action meets each at the same place.
+        # The order is random, too: no matter for a policy that scores each skill by itself. A whole
+        # pool is sorted, so that a policy with one output per action meets each at the same place.
         pool = self.action_pool
         self.available = pool
         if self.num_available < len(pool):
@@ -261,8 +261,8 @@ class GridWorldEnv(gym.Env):
             reward += 1 - LAMBDA_GOAL * moves / MAX_MOVES
 
         # End (A.1): goal, lava, or the limit. [here] the limit is `truncated`, gymnasium's word for
-        # an end that only a clock makes; [code] does not tell the two apart, nor does
-        # ppo_actiongen.py: it bootstraps after neither. Ten skills are exactly 50 moves.
+        # an end that only a clock makes. Learning ignores the difference: [code] and
+        # ppo_actiongen.py bootstrap after neither. Ten skills are exactly 50 moves.
         terminated = success or entered[-1] == LAVA
         truncated = not terminated and moves >= MAX_MOVES
         self.over = terminated or truncated
@@ -294,8 +294,8 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
     """A SyncVectorEnv of GridWorldEnv(action_pool, num_available, **options), seeded already.
 
     SAME_STEP: the step that ends an episode returns the first observation of the next one, and
-    infos["final_info"] holds `success`. Call `envs.reset()`; a seed given to it would replace
-    `seed`. ValueError as in GridWorldEnv.
+    infos["final_info"] holds `success`. Call `envs.reset()` for the first observations; a seed
+    given to it would replace `seed`. ValueError as in GridWorldEnv.
     """
 
     def make_env():
@@ -310,9 +310,9 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 # ---- A.1 Action Observations: the world of the recordings ----
 # hvae.py scales recordings: a first state becomes (cell - centre) / half_width, -1..1; differences
-# between states are divided by step, so they stay in cells [here]. A move of 1 cell is 7 times the
-# decoder's smallest standard deviation, 0.135 [code]; scaled like a first state, 1 / 39.5 = 0.025,
-# it would be lost in it.
+# from it, or from the state before, are divided by step: cells [here]. The decoder's standard
+# deviation is at least 0.135 [code]. A move of 1 cell is 7 times that; scaled like a first state it
+# would be 1 / 39.5 = 0.025, too small to matter.
 UNITS = dict(centre=39.5, half_width=39.5, step=1.0)
 
 
