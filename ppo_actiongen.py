@@ -1134,8 +1134,10 @@ def check(args):
     names = dict(split="SPLITS", task="TASKS", placement="PLACEMENTS")
     for option, allowed in names.items():
         value = getattr(args, option)
-        if value is not None and hasattr(module, allowed):
-            hvae.choose(option, value, getattr(module, allowed))
+        if value is not None:
+            hvae.choose(option, value, getattr(module, allowed, ("default",)))
+    if args.fully_observable and args.env != "recsys":
+        raise UserError("fully_observable: only the Recommender hides something (C.5)")
     if not args.representation.endswith(".npz"):
         variants = [f"engineered-{variant}" for variant in getattr(module, "VARIANTS", ())]
         allowed = [*ENCODERS, "engineered", *variants, "FILE.npz"]
@@ -1400,6 +1402,8 @@ def restrict_pool(options, module, table, pool, known):
 
 def evaluate_run(options):
     """Score a run's best checkpoint, print it, and write what --save and --gif ask for."""
+    if options.episodes < 1:
+        raise UserError("episodes must be at least 1")
     if options.gif and not options.gif.endswith(".gif"):
         raise UserError(f"gif {options.gif}: the name has to end in .gif")
     folder = Path(options.run)

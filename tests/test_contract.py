@@ -169,7 +169,6 @@ def test_files_import_neither_torch_nor_each_other(module):
     others = {*ENVIRONMENTS, "hvae", "ppo_actiongen", "torch", "matplotlib.pyplot"}
     others -= {module.__name__}
     code = f"import sys, {module.__name__}; print('found', *set(sys.modules) & {others!r})"
-    # A notebook's backend, inherited by a script, is none of its business.
     env = os.environ | {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
     command = [sys.executable, "-c", code]
     out = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=env)

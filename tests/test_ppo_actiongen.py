@@ -440,11 +440,13 @@ gridworld --num-envs 33; num_envs 33 must divide
 gridworld --representation missing.npz; missing.npz
 gridworld --representation hvea; 'hvea'; allowed: hvae, hvae-all, vae, engineered
 gridworld --representation engineered-6d; engineered-12d, engineered-5d
-gridworld --split fulll; 'fulll'; allowed: default
+gridworld --task push; 'push'; allowed: default
+gridworld --fully-observable; only the Recommender
 create --task pus; 'pus'; allowed: push
 gridworld --modality sound --representation hvae; 'sound'; allowed: xy
 gridworld --finetune nowhere; nowhere is not the folder of a finished run
 nowhere.py; nowhere.py
+evaluate nowhere --episodes 0; must be at least 1
 evaluate nowhere; nowhere/best.pt is no checkpoint"""
 
 
