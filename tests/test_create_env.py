@@ -216,6 +216,8 @@ def test_cannon_shoots_from_its_mouth_and_fan_adds_force_over_300_per_step(angle
     assert tuple(ball.body.position) == pytest.approx(mouth)
     shot = (force / 10 * math.cos(aim), force / 10 * math.sin(aim) - 2 / 30)
     assert tuple(ball.body.velocity) == pytest.approx(shot)
+    ball = drop(Tool("Cannon", force=100), (42.0, 42.0), steps=41)[2]
+    assert ball.body.position.x == pytest.approx(47 + 40 * 10 / 30)  # it is shot once
     space, _, ball = drop(Tool("Fan", angle=angle, force=force), (42.0, 42.0))
     ball.body.angle = 1.0  # the wind does not turn with the ball
     for k in range(1, 4):
@@ -312,13 +314,16 @@ def test_level_is_the_published_one(task):
 
 def test_level_shifts_stay_in_range_and_are_shared():
     push, funnel, seen, sides = CreateEnv(task="push"), CreateEnv(task="funnel"), [], set()
+    starts = set()
     for seed in range(40):
         push.reset(seed=seed), funnel.reset(seed=seed)
         x, y = push._target.place
         assert (x, y) - push._objects[1].place == pytest.approx((0, 0.11 * 42))
+        assert push._goal.place - push._objects[2].place == pytest.approx((0, 0.11 * 42))
+        starts |= {push._marker.place, push._goal.place}
         seen.append((x / 42 - 1 - 0.1, y / 42 - 1 + 0.14))
         sides.add(round(funnel._goal.place.x / 42 - 1, 6))
-    assert 0.15 < np.abs(seen).max() <= 0.2 and sides == {-0.28, 0.28}
+    assert 0.15 < np.abs(seen).max() <= 0.2 and sides == {-0.28, 0.28} and len(starts) == 80
 
 
 def wait_for_the_end(env: CreateEnv, action: dict = WAIT) -> list[float]:
@@ -389,6 +394,7 @@ def test_outcomes_and_their_rewards():
         (1, (-0.5, -0.6), "too close", 0.0),
         (1, (0.0, 0.25), "blocked", 0.0),
         (1, (1.0000001, 0.0), "outside", 0.0),
+        (1, (0.3, -1.0000001), "outside", 0.0),
         (1, np.array([0, -1]), "placed", 0.01),  # whole numbers are numbers
     ):
         _, paid, *_ = env.step({"choice": choice, "position": position})
@@ -401,6 +407,11 @@ def test_goal_pays_ten_and_ends_and_in_push_the_target_hit_pays_with_it(task, pa
     env = fixed_env(task, subgoal_reward=paid)
     move_ball(env._target, *(env._goal.place + (7.0, 2.0)))
     assert env.step(WAIT)[1:] == (pytest.approx(reward), True, False, {"success": 1.0})
+    if task == "push":
+        env.reset(seed=0)
+        env._target_hit = True
+        move_ball(env._marker, *(env._goal.place + (7.0, 2.0)))
+        assert not env.step(WAIT)[2]  # the wrong ball
 
 
 @pytest.mark.parametrize("stays", [False, True])
@@ -439,6 +450,9 @@ def test_subgoal_pays_once_and_goes(paid, reward, task, ball):
         move_ball(getattr(env, ball), *subgoal.place)
         assert env.step(WAIT)[1] == pytest.approx(expected)
         assert not env._subgoals and subgoal not in env._objects
+    move_ball(getattr(env, ball), 80.0, 80.0)
+    x, y = map(int, subgoal.place)
+    assert env.step(WAIT)[0]["state"][-1, 84 - y, x] == 255  # nor is it seen any more
 
 
 def test_time_limit_truncates_and_balls_that_leave_terminate():
@@ -453,8 +467,10 @@ def test_time_limit_truncates_and_balls_that_leave_terminate():
     env._target_hit = True  # then the marker does not matter any more
     move_ball(env._marker, -1.0, 40.0)
     assert env.step(WAIT)[2] is False
-    move_ball(env._target, 40.0, -5.0)
-    assert env.step(WAIT)[2] is True
+    for place in ((40.0, -5.0), (90.0, 40.0), (40.0, 90.0)):
+        env = fixed_env("push")
+        move_ball(env._target, *place)
+        assert env.step(WAIT)[2] is True
 
 
 # ---- what the agent sees and may do ----
@@ -526,6 +542,8 @@ def test_every_class_has_its_own_look(colour):
         assert canvas.picture().min() < 200, kind
         looks.add(canvas.picture().tobytes())
     assert len(looks) == len(KINDS) - 1
+    c.draw(canvas, Tool("Lever", size=30), Vec2d(42, 42), math.pi / 2)
+    assert canvas.picture()[30, 41:43].min() < 230  # it turns
 
 
 def test_the_no_op_and_k_minus_1_tools_are_available():
@@ -656,6 +674,14 @@ def test_probe_trajectories_meet_the_tool(kind):
     assert (distance.min(axis=1) < 0.75).mean() > 0.95
 
 
+def test_probe_balls_that_miss_or_begin_inside_are_launched_again(monkeypatch):
+    calls, launch = [], c._launch
+    monkeypatch.setattr(c, "_launch", lambda *a: calls.append(launch(*a)) or calls[-1])
+    c.action_observations([find_tool("Ramp", size=6)], 200)
+    again = [int(np.isin(contact, (0, c.PROBE_STEPS + 1)).sum()) for _, contact in calls]
+    assert again[0] > 0 and [len(contact) for _, contact in calls] == [200, *again[:-1]]
+
+
 def test_observations_of_all_modalities_are_of_the_same_scenes(capfd):
     ids = [5, 1500, 900, 2050]
     states = c.action_observations(ids, 3, "state", seed=4, workers=2)
@@ -702,7 +728,6 @@ def test_play_follows_mouse_and_keys_without_a_display(monkeypatch):
 
         space = KeyEvent("key_press_event", figure.canvas, " ")
         figure.canvas.draw()
-        assert click(scene, 150, 440) == (0, "waited")  # the caption
         assert click(scene, 500, 170) == (0, "waited")  # the policy's pictures
         assert click(scene, 150, 170) == (1, "waited")  # the no-op is chosen at first
         assert click(menu, 0.5, 1.5) == (1, "waited")

@@ -197,8 +197,3 @@ def test_same_refuses_a_grid_world_that_differs_while_its_option_is_off(check, t
     for constant in ("LAMBDA_SUBGOAL = 0.1", "LAMBDA_GOAL = 0.9"):
         file.write_text(text.replace(constant, constant[:-1] + "5"), encoding="utf-8")
         assert "same rewards" in check.grade("same", file)
-
-
-def test_check_names_what_it_does_not_know(check):
-    with pytest.raises(SystemExit, match="^error: berta.py is no file, and only 01, 02, "):
-        check.main(["6", "berta.py"])

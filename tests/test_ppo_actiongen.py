@@ -445,7 +445,6 @@ gridworld --fully-observable; only the Recommender
 create --task pus; 'pus'; allowed: push
 gridworld --modality sound --representation hvae; 'sound'; allowed: xy
 gridworld --finetune nowhere; nowhere is not the folder of a finished run
-nowhere.py; nowhere.py
 evaluate nowhere --episodes 0; must be at least 1
 evaluate nowhere; nowhere/best.pt is no checkpoint"""
 

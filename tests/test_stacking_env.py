@@ -186,11 +186,12 @@ def test_the_state_shows_the_right_side_and_the_published_scale(env):
 
 
 def test_viewpoints_lie_on_the_published_circles(monkeypatch):
-    eyes, blank = [], np.zeros((84, 84, 3))
-    monkeypatch.setattr(stacking_env, "photograph", lambda _, c: eyes.append(c[0]) or blank)
+    cameras, blank = [], np.zeros((84, 84, 3))
+    monkeypatch.setattr(stacking_env, "photograph", lambda _, c: cameras.append(c) or blank)
     stacking_env._views(12, 3, 0)
     stacking_env._views(12, 400, 0)
-    assert eyes[:3] == eyes[3:6]  # view k does not depend on their number
+    eyes, targets = zip(*cameras, strict=True)
+    assert set(targets) == {(0, 0, 0)} and eyes[:3] == eyes[3:6]  # view k alone
     x, y, z = np.array(eyes).T
     assert np.allclose(np.hypot(x, y), 2.0) and 0.5 <= z.min() < 0.52 and 1.98 < z.max() <= 2.0
     assert abs(np.cos(np.arctan2(y, x)).mean()) < 0.1 and abs(z.mean() - 1.25) < 0.08
@@ -200,8 +201,10 @@ def test_viewpoints_lie_on_the_published_circles(monkeypatch):
 @pytest.mark.parametrize("early, nth, slide, lean", [(1, 1, 2e-3, 0.01), (0, 29, 6e-3, 0.03)])
 def test_every_shape_comes_to_rest_where_it_was_put(early, nth, slide, lean):
     """Let go 2 cm over the table: no sinking, no exploding, no sliding, no tipping."""
-    env = StackingEnv(early_stop=early)
+    env, steps = StackingEnv(early_stop=early), []
     env.reset(seed=0)
+    simulate = env._bullet.stepSimulation
+    env._bullet.stepSimulation = lambda: steps.append(simulate())
     for shape_id in range(0, 810, nth):
         stacking_env.empty_world(env._bullet)
         env._bodies, env.shape_ids = [], []
@@ -211,6 +214,7 @@ def test_every_shape_comes_to_rest_where_it_was_put(early, nth, slide, lean):
         (end,), (rotation,) = env.poses()
         assert np.abs(start - end - (0, 0, stacking_env.DROP_GAP)).max() < slide, shape_id
         assert np.abs(rotation - upright).max() < lean, shape_id
+    assert early or len(steps) == 300 * len(range(0, 810, nth))
     env.close()
 
 
@@ -266,7 +270,7 @@ def test_any_play_keeps_a_finite_scene_on_the_table(seed, moves):
 
 # ---- rules ----
 def test_start_two_equal_cylinders_apart_in_random_colours(env):
-    sizes, colours = set(), set()
+    sizes, colours, middles = set(), set(), []
     for seed in range(40):
         obs, info = env.reset(seed=seed)
         (a, b), _ = env.poses()
@@ -275,8 +279,10 @@ def test_start_two_equal_cylinders_apart_in_random_colours(env):
         assert 0.32 < a[2] < 0.36 and abs(a[2] - b[2]) < 1e-3 and abs(a[1]) < 1e-3
         assert obs["state"][:3].max() == 0 and obs["state"][3].max() > 0  # only the newest frame
         sizes.add(round(2 * SHAPES[env.shape_ids[0]].scale, 3))
+        middles.append((a[0] + b[0]) / 2)
         colours |= {env._bullet.getVisualShapeData(body)[0][7] for body in env._bodies}
     assert sizes == {0.657, 0.684, 0.712} and len(colours) == 80  # the published heights
+    assert -0.21 < min(middles) < -0.1 and 0.1 < max(middles) < 0.21
 
 
 def test_reward_is_eq_4_on_the_last_step_only(env):
