@@ -443,7 +443,6 @@ gridworld --representation engineered-6d; engineered-12d, engineered-5d
 gridworld --task push; 'push'; allowed: default
 gridworld --fully-observable; only the Recommender
 create --task pus; 'pus'; allowed: push
-gridworld --modality sound --representation hvae; 'sound'; allowed: xy
 gridworld --finetune nowhere; nowhere is not the folder of a finished run
 evaluate nowhere --episodes 0; must be at least 1
 evaluate nowhere; nowhere/best.pt is no checkpoint"""
