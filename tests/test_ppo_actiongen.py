@@ -717,9 +717,9 @@ def test_adaptation_is_to_the_whole_test_set_from_scratch_or_from_a_run(tmp_path
     changed = {k for k in source if not torch.equal(weights[k], source[k])}
     head = {"head.weight"} if method == "nearest-neighbor" else set()
     assert changed - {"head.bias"} == head  # published: its outputs are new
-    for option, there in (("--split-seed", "split_seed is 0"), ("--task", "task is None")):
-        with pytest.raises(UserError, match=f"cannot be fine-tuned: its {there}"):
-            small(tmp_path, "--finetune", first, "--method", method, option, 1)
+    for name, there in (("split_seed", 0), ("task", None)):
+        with pytest.raises(UserError, match=f"cannot be fine-tuned: its {name} is {there}"):
+            ppo.start_from(SimpleNamespace(args=replace(args, **{name: 7})), Path(first))
 
 
 # ---- torchrun ----
