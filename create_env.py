@@ -135,9 +135,9 @@ class Kind(NamedTuple):
     colour: str  # as people see it; the policy sees the grey that Pillow makes of it
     contact: int = PLAIN
     sides: int = 0  # of polygons
-    radius: float = 1.0  # units, of segments: [code]: thickness // 2 (1, 2 or 2.5), so 0, 1 or 1
-    # Degrees: angles stay below it, because the shape is the same again after this turn. See-saws
-    # have limits in place of angles: [code] below 60 with a weight, below 90 without.
+    radius: float = 1.0  # units, of segments: [code]'s thickness // 2, so 0 or 1
+    # Degrees after which the shape is the same again: angles stay below. For see-saws a bound on
+    # their limits: [code] 60 with a weight, 90 without.
     turn: int = 360
     # The tools of the class: the values of each parameter. The first parameter varies slowest from
     # id to id. Level objects have none.
@@ -159,7 +159,7 @@ RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# A corner points to the angle. At 45 a square lies flat: [code] calls that a box; no split has any.
+# A corner points to the angle. At 45 a square lies flat: [code] has these, too, in no split.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. What A.3 calls friction is their damping; Coulomb friction is 0 [code].
@@ -176,7 +176,7 @@ BOUNCY_BALLS = {"elasticity": (0.8, 0.9, 1.0, 1.1, 1.2), "size": (3, 5, 7, 9), "
 BELTS = {"size": range(6, 25, 2), "speed": (1, 2, 3, 4, 5, 6, -1, -2, -3, -4, -5, -6)}
 
 # Colours whose greys (0.299 R + 0.587 G + 0.114 B) are those that [code] shows to the policy. Its
-# pictures are mirrored left to right, and some are image files; [here] flat shapes, not mirrored.
+# pictures are mirrored left to right, and some are image files; [here] flat shapes, as x grows.
 ORANGE = "#fa8535"
 BLUE = "#086788"
 WOOD = "#fa9149"
@@ -250,7 +250,7 @@ def _tools_of(name: str, step: int = COARSE_STEP) -> list[Tool]:
     choices = dict(kind.vary)
     for parameter in kind.vary.keys() & ANGULAR:
         values = kind.vary[parameter]
-        if step == FINE_STEP:  # the same range in smaller steps
+        if step == FINE_STEP:  # the same range in smaller steps (all of these classes have ranges)
             values = range(values.start, values.stop, step)
         choices[parameter] = [value for value in values if value < kind.turn]
     rows = product(*choices.values())
@@ -279,9 +279,8 @@ NUM_ACTIONS = len(TOOLS)  # 8,359 distinct tools over all splits
 # Arrays (NUM_ACTIONS,): the class; the angle in degrees (of see-saws the limit, 0 without angles).
 TOOL_KINDS = np.array([tool.kind for tool in TOOLS])
 TOOL_ANGLES = np.array([tool.max_angle or tool.angle for tool in TOOLS])
-# Is it one of the tools 15 degrees apart (limits 5, 20, ...), not one that the analyses add? Modulo
-# 15, angles are 0, 3, .. 12, limits 2, 5, .. 14: so 0 is a coarse angle, 5 a coarse limit.
-IS_COARSE = np.isin(TOOL_ANGLES % COARSE_STEP, (0, FIRST_LIMIT))
+# Is it one of the tools 15 degrees apart, not one that the analyses add?
+IS_COARSE = np.arange(NUM_ACTIONS) < 2_326
 IS_COARSE |= np.isin(TOOL_KINDS, list(OWN_KINDS))
 
 
@@ -301,7 +300,7 @@ def engineered_representations() -> np.ndarray:
     (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are 15 degrees
     apart (over the 2,111 alone the speed would be constant).
     """
-    # [code] orders the classes anew in every run, and has boxes; [here] sorted, without (NO_BOX).
+    # [code] orders the classes anew in every run, and has flat squares (NO_BOX); [here] sorted.
     one_hot = TOOL_KINDS[:, None] == np.unique(TOOL_KINDS)  # (NUM_ACTIONS, 21)
     numbers = np.array([tool[1:10] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])  # the angles
@@ -315,8 +314,8 @@ def engineered_representations() -> np.ndarray:
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
 # main results come from this draw (cannons: 12 of 24 angles). Others may be harder: 1.9 % of them
-# (C(19, 7) / C(24, 12): five angles fixed, 7 of the other 19) train on all five from 120 to 180
-# degrees; then no test cannon shoots up and well to the left, where most goals are.
+# train on all five cannon angles from 120 to 180 degrees; then no test cannon shoots up and well to
+# the left, where most goals are.
 TRAINING_ANGLES = {
     ("Ramp", "Trampoline"): (45, 60, 75, 90, 105, 165),
     ("Triangle", "Bouncy Triangle"): (30, 45, 60, 105),
@@ -347,7 +346,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     | default  | 1,097 | 507   | 506   | half of the angles of each class, the published draw   |
     | random   | 1,097 | 507   | 506   | half of the angles of each class, drawn by `seed`      |
     | full     | 938   | 400   | 399   | by tool class, Table 1                                 |
-    | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; held out: others of 3         |
+    | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; the rest: multiples of 3      |
 
     `seed` also draws which held-out tools are for validation, which for the test. The parts are
     disjoint. The no-op (id 0) is in none of them, because it is always available. The paper counts
@@ -360,10 +359,11 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         raise ValueError(f"unknown split {split!r}; allowed: {', '.join(SPLITS)}")
     rng = np.random.default_rng(seed)
 
-    # Two masks over all tools: which belong to the split, and which of these are for training.
+    # Two masks over all tools: which belong to the split, and which of these are for training. The
+    # rest of the split is held out.
     pool = np.zeros(NUM_ACTIONS, bool)
     train = np.zeros(NUM_ACTIONS, bool)
-    if split == "full":
+    if split == "full":  # whole classes are held out
         pool = IS_COARSE & np.isin(TOOL_KINDS, TABLE_1)
         train = IS_COARSE & np.isin(TOOL_KINDS, TABLE_1_TRAIN)
     elif split == "analysis":
@@ -371,7 +371,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         # with the no-op, and 30 degrees; [here] as [code], because only 30 degrees give 762.
         pool = np.isin(TOOL_KINDS, FINE_KINDS)
         train = pool & np.isin(TOOL_ANGLES % 30, (0, FIRST_LIMIT))  # see-saws: limits 5, 35, 65
-    else:
+    else:  # angles are held out
         for group, angles in TRAINING_ANGLES.items():
             members = IS_COARSE & np.isin(TOOL_KINDS, group)
             if split == "random":
@@ -454,7 +454,6 @@ class Task:
     # every reset: for target, goal and marker, and for the items with this name as their `shift`.
     shifts: dict[str, float | tuple[float, float]] = field(default_factory=dict)
     subgoals: tuple = ()  # places (norm), for the marker if there is one, else the target
-    walls: tuple[Item, ...] = ()  # at the edges of the screen, never at the bottom
     marker_must_touch: bool = False  # [code] no target hit before marker and target have touched
     target_hit_reward: float = LAMBDA_TARGET_HIT
     goal_on_either_side: bool = False  # the goal's x changes sign with probability 1/2
@@ -478,6 +477,7 @@ box = partial(item, "Box", elasticity=0.1, size=5, mass=30)
 bucket = partial(item, "Bucket", size=4)
 belt = partial(item, "Conveyor Belt", size=7)
 ladder = partial(item, "Ladder", angle=95, speed=4)
+# Walls at the edges of the screen, never at the bottom.
 RIGHT_WALL = line(1, 0, 90, 90, kind="Boundary")
 LEFT_WALL = line(-1, 0, 90, 90, kind="Boundary")
 CEILING = line(0, 1, 90, kind="Boundary")
@@ -505,26 +505,27 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # Two pairs of boxes fall: catch them. The right pair would bar the marker's way, by the subgoal
-    # and then down, back to the target; the left pair the target's way, down a slope to the star.
+    # Two pairs of boxes fall: catch them. Else the right pair blocks the marker's way (by the
+    # subgoal, down, back to the target), the left pair the target's (down a slope to the star).
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
                line(-0.8, -0.81, 16), line(0.12, -0.59, 16), line(-0.34, -0.70, 24.5, 22.5),
                box(-0.7, 0.3), box(-0.7, 0.2), line(-0.6, 0.18, 15, 90), line(-0.8, 0.18, 15, 90),
-               line(0.35, 0.8, 15, 90), box(0.25, 0.93), box(0.25, 0.83), line(0.15, 0.8, 15, 90)),
+               line(0.35, 0.8, 15, 90), box(0.25, 0.93), box(0.25, 0.83), line(0.15, 0.8, 15, 90),
+               *ROOM),
         shifts={"marker": 0.02, "target": (0.02, 0.0)},
-        subgoals=((0.7, -0.1),), walls=ROOM, marker_must_touch=True,
+        subgoals=((0.7, -0.1),), marker_must_touch=True,
         target_hit_reward=2.0,  # appendix: 1; [code] 2; [here] as [code]
         max_actions=50),  # appendix: 30; [code] 50; [here] as [code], the published task
-    # The see-saw's low right end bars the gap left of the wall: lead the heavy ball to its left.
+    # The see-saw's low right end bars the gap left of the wall: lead the heavy ball to the other.
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9), goal=star(-0.8, -0.8),
         items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
                item("Level see-saw", -0.3, -0.1, size=30, max_angle=30, mass=1, left_up=True,
                     friction=0),
-               line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20)),
-        shifts={"ball": 0.05, "target": 0.1}, subgoals=((-0.1, -0.45),), walls=ROOM),
+               line(0.1, -0.7, 40, 90), line(-0.9, -0.3, 20), *ROOM),
+        shifts={"ball": 0.05, "target": 0.1}, subgoals=((-0.1, -0.45),)),
     # The marker falls onto a long floor: move it over the edge, then the target back to the left.
     "navigate": Task(
         marker=ball("Marker", -0.6, 0.75), target=ball("Target", 0.1, -0.24),
@@ -549,14 +550,13 @@ TASKS = {
     # The target, knocked off its shelf, falls into the cannon; its flight has to be bent.
     "cannon": Task(
         marker=ball("Marker", 0.8, 0.75), target=ball("Target", 0.4, 0.11), goal=star(-0.7, -0.1),
-        items=(line(-0.1, 0.35, 55, 90), item("Cannon", -0.1, -0.8, angle=110, force=140),
-               line(0.4, 0.0, 8, shift="target")),
-        shifts={"marker": 0.1, "target": 0.05, "goal": 0.05},
-        walls=(RIGHT_WALL, CEILING), marker_must_touch=True),
+        items=(RIGHT_WALL, CEILING, line(-0.1, 0.35, 55, 90),
+               item("Cannon", -0.1, -0.8, angle=110, force=140), line(0.4, 0.0, 8, shift="target")),
+        shifts={"marker": 0.1, "target": 0.05, "goal": 0.05}, marker_must_touch=True),
     # Two balls fall on two sides of a wall: make them meet.
     "collide": Task(
         target=ball("Target", 0.6, 0.7), goal=ball("Goal ball", -0.6, 0.7),
-        items=(line(0.0, 0.25, 35, 90),), shifts={"target": 0.1, "goal": 0.1}, walls=ROOM),
+        items=(line(0.0, 0.25, 35, 90), *ROOM), shifts={"target": 0.1, "goal": 0.1}),
     # The goal is a ball that bounces on a trampoline.
     "moving": Task(
         target=ball("Target", 0.6, 0.75), goal=ball("Goal ball", -0.7, 0.0),
@@ -604,7 +604,7 @@ MUZZLE = (5.0, 3.65)  # [code] units, half the unturned box: a shot starts (5 co
 # funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees, a bucket's at 135, 225, 315 and 45.
 LAST_CORNER = {"Funnel": 30, "Bucket": 45}
 # [code] The probe ball touches the no-op when its centre is within 0.1 sqrt(8) norm, 11.9 units: a
-# disc smaller by the ball's radius does so ([here] at any step). A sensor (GOAL), it is only felt.
+# disc smaller by the ball's radius does so. A sensor (GOAL), it is only felt.
 NO_OP_RADIUS = 0.1 * sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
@@ -693,13 +693,13 @@ class SceneObject:
     def _fixtures(self, static_body: pymunk.Body) -> list:
         """What holds a plank at its pivot and limits its turn; the weight on its end, if any."""
         # [code] has a pin joint of length zero and a slide joint, and a load shakes the centre.
-        # [here] pivot and limit joints: on average over 800 launches per class balls move alike.
+        # [here] pivot and limit joints hold it; over 800 launches per class balls move alike.
         fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
         limit = radians(self.tool.max_angle)
         tilt = start_tilt(self.tool)
         if self.tool.kind == "Level see-saw":
-            # As in [code]: at rest under its heavy ball it would end episodes early (`_ended`). The
-            # point 1 unit left of the pivot stays within the chord of `limit` from level.
+            # As in [code], for it has to shake: a still one would end episodes early (`_ended`).
+            # The point 1 unit left of the pivot stays within 2 sin(limit / 2) of its level place.
             fixtures = [pymunk.PinJoint(self.body, static_body, (0, 0), self.place)]
             slide = (Vec2d.from_polar(-1, tilt), self.place - (1, 0), 0, 2 * sin(limit / 2))
             fixtures.append(pymunk.SlideJoint(self.body, static_body, *slide))
@@ -718,9 +718,10 @@ class SceneObject:
 
 # ---- the physics: what happens when two objects touch ----
 
-# In these rules `mover` is the ball or loose box that touches something. `process_collision` False
-# lets the two pass through each other, and stays False as long as they touch: a rule that decides
-# anew at every step must write True and False.
+# In these rules `mover` is the ball or loose box that touches something. A rule is called once, as
+# a contact begins (`begin`), or at every step of it, before or after its forces (`pre_solve`,
+# `post_solve`). `process_collision` False lets the two pass through each other, and stays False as
+# long as they touch: a rule that decides anew at every step must write True and False.
 
 
 def _put_at_rest(body: pymunk.Body, position: tuple[float, float]) -> None:
@@ -729,7 +730,6 @@ def _put_at_rest(body: pymunk.Body, position: tuple[float, float]) -> None:
     body.force = (0.0, 0.0)
     body.angle = 0.0
     body.angular_velocity = 0.0
-    body.torque = 0.0
 
 
 def _on_goal(arbiter, space, data) -> None:
@@ -740,7 +740,7 @@ def _on_goal(arbiter, space, data) -> None:
 
 
 def _on_carrier(arbiter, space, data) -> None:
-    """A ball on a belt or a ladder gets its velocity at every step, so it does not fall through."""
+    """Belts and ladders set a ball's velocity at every step, so it does not fall through."""
     mover, carrier = (shape.owner for shape in arbiter.shapes)
     aim = radians(carrier.tool.angle)
     lean = LADDER_LEAN if carrier.kind.contact == LADDER else 1.0
@@ -793,7 +793,7 @@ def _on_bucket(arbiter, space, data) -> None:
 
 
 def _on_plank(arbiter, space, data) -> None:
-    """A damping above 1 slows a ball at every step: 1.05 takes 5 % of its speed [code]."""
+    """[code] A damping above 1 slows balls, not boxes, at every step: 1.05 by 5 %."""
     mover, plank = (shape.owner for shape in arbiter.shapes)
     keep = 2.0 - plank.tool.damping
     # With a damping of 1 nothing is written, because that would wake a sleeping ball.
@@ -807,7 +807,6 @@ def make_space() -> pymunk.Space:
     space = pymunk.Space()  # 10 solver iterations and no damping are pymunk's defaults
     space.gravity = GRAVITY
     space.sleep_time_threshold = SLEEP_TIME
-    # begin: once per contact. pre_solve, post_solve: at every step, before and after the forces.
     # A target that stays on a goal is noted anew: `_judge` forgets the touch after each action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
     # Two balls: as their touch begins [code]. But never give a task both a marker and a goal ball:
@@ -900,7 +899,7 @@ def draw(canvas: Canvas, tool: Tool, place: Vec2d, angle: float = 0.0) -> None:
             canvas.line(corners, 1.2, colour)  # open from the last corner to the first
         case "Basket":
             canvas.line([*corners, corners[0]], 1.0, colour)
-        case "Goal star" if canvas.in_colour:  # in grey the pentagon that balls have to touch
+        case "Goal star" if canvas.in_colour:  # grey: [code]'s pentagon, which balls touch
             canvas.polygon([corners[k] for k in (0, 2, 4, 1, 3)], colour)
             canvas.stroke([place], 2.8, colour)  # Pillow leaves the middle of the star empty
         case "Ladder":
@@ -993,7 +992,7 @@ class CreateEnv(gym.Env):
         super().reset(seed=seed)
 
         # Subsampling: every episode has its own few tools of the pool, unless all are available.
-        # ([code] draws a class first in the Full Split's tests; [here] all tests draw alike.)
+        # ([code] draws a class first in the Full Split's tests; [here] all scores draw alike.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
@@ -1006,7 +1005,7 @@ class CreateEnv(gym.Env):
         self.placement = "waited"  # what came of it
 
         # What has been reached. Without a marker ball no target hit is asked for.
-        self._goal_hit = False
+        self._goal_reached = False
         self._target_hit = self._marker is None
         self._still = 0  # actions that ended without motion; it only grows
         self._over = False
@@ -1026,16 +1025,13 @@ class CreateEnv(gym.Env):
         for name, half_range in task.shifts.items():
             self._shifts[name] = self.np_random.uniform(np.negative(half_range), half_range, 2)
 
-        # Contacts are solved in the order of adding, so it is part of a level. It is [code]'s, but
-        # in cannon [code] adds the walls before the items. Subgoals and walls are never shifted.
+        # Contacts are solved in the order of adding, so it is part of a level: it is [code]'s.
         self._space = make_space()
         self._objects = []
         self._marker = self._add(task.marker, "marker") if task.marker else None
         for one in task.items:
             self._add(one, one.shift)
         self._subgoals = [self._add(item("Subgoal", x, y, size=3)) for x, y in task.subgoals]
-        for wall in task.walls:
-            self._add(wall)
         self._target = self._add(task.target, "target")
         goal = task.goal
         if task.goal_on_either_side and self.np_random.random() < 0.5:
@@ -1085,15 +1081,15 @@ class CreateEnv(gym.Env):
                 self._take_picture()
 
         # Judge: who touched whom meanwhile, and is the episode over?
-        goal_reached, subgoals_reached, hit_now = self._judge()
+        subgoals_reached, hit_now = self._judge()
         terminated, truncated = self._ended()
         self._over = terminated or truncated
 
         # Pay by Equation 3, and show the agent what has become of the world.
-        reward = self._pay(goal_reached, subgoals_reached, hit_now)
+        reward = self._pay(subgoals_reached, hit_now)
         observation = self._observe()
         self._take_picture()
-        info = {METRIC: float(self._goal_hit)} if self._over else {}
+        info = {METRIC: float(self._goal_reached)} if self._over else {}
         return observation, reward, terminated, truncated, info
 
     def _place(self, position: list[float]) -> str:
@@ -1113,6 +1109,7 @@ class CreateEnv(gym.Env):
         if self._space.shape_query(new.shape):  # sensors, as goals are, block too
             return "blocked"
 
+        # It stays. What does not move joins the picture of all that stands still.
         self._space.add(*new.parts)
         self._objects.append(new)
         self._centres.append(position)
@@ -1120,10 +1117,10 @@ class CreateEnv(gym.Env):
             draw(self._background, new.tool, place)
         return "placed"
 
-    def _judge(self) -> tuple[bool, int, bool]:
-        """What this action achieved: (goal reached, subgoals reached, target hit just now)."""
-        # First ([code]: last; its goal waits an action) the target hit: far from its start and, if
-        # the task asks, touched by the marker. [code] Off the screen it counts as at the edge.
+    def _judge(self) -> tuple[int, bool]:
+        """What this action achieved; returns (subgoals reached, target hit just now)."""
+        # First the target hit ([code]: last, so the goal comes an action later): far from its start
+        # and, if the task asks, touched by the marker. [code] Off the screen counts as at its edge.
         hit_now = False
         if not self._target_hit:
             place = np.clip(self._target.body.position, 0.0, WORLD)
@@ -1133,7 +1130,7 @@ class CreateEnv(gym.Env):
 
         # Then the goal. In obstacle and cannon a fan can bring the target there before the marker
         # touches it. [code] remembers that until the hit; [here] it is forgotten after the action.
-        self._goal_hit = self._target_hit and self._goal.touched
+        self._goal_reached = self._target_hit and self._goal.touched
         self._goal.touched = False
 
         # Then the subgoals; a reached one is gone from this picture on ([code]: the next). [code]
@@ -1145,16 +1142,16 @@ class CreateEnv(gym.Env):
             self._subgoals.remove(subgoal)
         if reached:
             self._background = self._draw_objects(Canvas(84, in_colour=False), moving=False)
-        return self._goal_hit, len(reached), hit_now
+        return len(reached), hit_now
 
-    def _pay(self, goal_reached: bool, subgoals_reached: int, hit_now: bool) -> float:
+    def _pay(self, subgoals_reached: int, hit_now: bool) -> float:
         """The reward, A.3 Equation 3: alive, goal, subgoals, target hit, invalid, overlap."""
-        # appendix: products of the bonus terms, which would pay nothing before the goal. [code]
-        # sums, and takes off 0.1 per placed tool. [here] sums; the appendix has no cost of tools.
+        # appendix: a product of the three bonuses, 0 unless all come in one action. [code] sums
+        # them, and takes off 0.1 per placed tool. [here] sums; the appendix has no cost of tools.
         reward = LAMBDA_ALIVE + REFUSED.get(self.placement, 0.0)
-        reward += goal_reached * LAMBDA_GOAL  # an indicator of Eq. 3 is True or False, 1 or 0
-        # C.3 switches off the rewards of subgoals. Figure 10 has push too, a task without subgoals,
-        # so the reward for the target hit must have been meant as well.
+        reward += self._goal_reached * LAMBDA_GOAL  # an indicator of Eq. 3 is True or False, 1 or 0
+        # C.3 switches off the rewards of subgoals. [here] the target hit's, too: Figure 10 shows
+        # push, which has no subgoals.
         if self.subgoal_reward:
             reward += subgoals_reached * LAMBDA_SUBGOAL
             reward += hit_now * self.task.target_hit_reward
@@ -1162,7 +1159,8 @@ class CreateEnv(gym.Env):
 
     def _ended(self) -> tuple[bool, bool]:
         """(terminated, truncated) after this action."""
-        # appendix: three ends; [code] a lost ball, too; [here] as [code] (marker: until the hit).
+        # The ends: the goal, a second still action, the limit of actions; [code], not the appendix,
+        # a lost ball, too (the marker: only until the target hit).
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
         # A.3 "no moving objects" [code], by the speed of centres. A tool's plank only turns: still.
@@ -1172,7 +1170,7 @@ class CreateEnv(gym.Env):
         if all(body.velocity.length < STILL_SPEED for body in moving):
             self._still += 1
         # appendix: the episode ends at the goal; [code] goes on; [here] as the appendix.
-        terminated = self._goal_hit or lost or self._still >= STILL_ACTIONS
+        terminated = self._goal_reached or lost or self._still >= STILL_ACTIONS
         # appendix: 30 actions; [code] one more than its limit; [here] the exact limit.
         return terminated, not terminated and self._actions >= self.task.max_actions
 
@@ -1211,7 +1209,7 @@ class CreateEnv(gym.Env):
         state = Image.fromarray(np.vstack(self._frames)).resize((size // 3, size))
         page.paste(state, (size + 6, 0))
         caption = f"{self._actions}/{self.task.max_actions}  {self._tool.kind} {self.placement}"
-        if self._goal_hit:
+        if self._goal_reached:
             caption += ", goal!"
         ImageDraw.Draw(page).text((8, size + 15), caption, INK, ImageFont.load_default(16), "lm")
         self._pictures.append(np.array(page))
@@ -1239,6 +1237,7 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 # ---- A.3, B action observations: the probe ball ----
 
+# How a tool deflects a ball tells what it does, so the agent can use one that it has never tried.
 PROBE_ATTEMPTS = 8  # [code] launches of a ball that misses the tool; the last one is kept
 PROBE_STEPS = 90  # [code] physics steps per launch
 PROBE_EVERY = 10  # [code] a state is recorded after steps 10, 20, ..., 90
@@ -1248,9 +1247,9 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# For hvae.py: it turns a first state into (x - centre) / half_width, so leaves it as it is, and
-# divides differences between states by step. [here] step is 4 units, 4 / 42 norm: the decoder's
-# smallest standard deviation, exp(-2) = 0.135 steps, is half a unit, a pixel of the observation.
+# hvae.py scales a first state to (x - centre) / half_width, so here leaves it as it is (norm), and
+# divides differences between states by `step`. [here] 4 units, 4 / 42 norm: the decoder's smallest
+# standard deviation, exp(-2) = 0.135 steps, is then half a unit, half a pixel of the observation.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1297,20 +1296,20 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
         # From anywhere a ball flies towards the tool, faster from afar and after misses [code].
         start = rng.uniform(-1.0, 1.0, (len(missing), 2))
         gap = places[missing] - start
-        distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (missing, 1) norm
+        distance = np.linalg.norm(gap, axis=1, keepdims=True)  # (missing, 1)
         speed = PROBE_SPEED * (1 + 0.4 * min(attempt, PROBE_ATTEMPTS - 1)) * (1 + distance)
         speed *= rng.uniform(0.6, 1.4, (len(missing), 1))
         velocity = speed * gap / np.maximum(distance, 1e-9)
-        states, contact = _launch(tool, places[missing], start, velocity)
+        states, touched_at = _launch(tool, places[missing], start, velocity)
 
-        # `contact`: 0 = started inside the tool, always launch again; 1..90 = step of the first
+        # `touched_at`: 0 = started inside the tool, always launch again; 1..90 = step of the first
         # touch, keep; 91 = a miss, launch again, but from the 8th launch on keep it.
-        hit = contact <= PROBE_STEPS
-        done = (contact > 0) & (hit | (attempt >= PROBE_ATTEMPTS - 1))
+        hit = touched_at <= PROBE_STEPS
+        done = (touched_at > 0) & (hit | (attempt >= PROBE_ATTEMPTS - 1))
 
         # Keep 7 of 9 states, starting 3 before the touch, clipped to a start of 0..2; after a miss
         # start at 1. So the touch is in the middle, except for very early and very late ones.
-        touch = (contact[done] - 1) // PROBE_EVERY  # the first state recorded at the touch or later
+        touch = (touched_at[done] - 1) // PROBE_EVERY  # the first state recorded at it or later
         first = np.where(hit[done], np.clip(touch - 3, 0, 2), 1)
         columns = first[:, None] + np.arange(PROBE_LENGTH)  # (done, 7)
         trajectories[missing[done]] = np.take_along_axis(states[done], columns[..., None], axis=1)
@@ -1336,6 +1335,7 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
         arbiter.shapes[0].owner.touched = True
 
     space.on_collision(MOVING, begin=on_touch)
+    # Overlaps are looked for before the balls join the space, or each ball would find itself.
     tools = []
     for place in (to_units(places) + offsets).tolist():
         tools.append(SceneObject(tool, Vec2d(*place), space.static_body))
@@ -1350,18 +1350,18 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
 
     states = np.zeros((m, PROBE_STEPS // PROBE_EVERY, 7), np.float32)
     states[..., :2] = places[:, None]
-    contact = np.ones(m, int)  # grows with every step until the ball touches the tool
+    touched_at = np.ones(m, int)  # grows with every step until the ball touches the tool
     for step in range(1, PROBE_STEPS + 1):
         space.step(DT)
-        contact += [not probe.touched for probe in probes]
+        touched_at += [not probe.touched for probe in probes]
         if step % PROBE_EVERY == 0:
             now = states[:, step // PROBE_EVERY - 1]  # (m, 7), a view
             now[:, 2:4] = ([probe.body.position for probe in probes] - offsets) * 2 / WORLD - 1
             # [code] maps velocities like positions (v/42 - 1, a slip); [here] v/42
             now[:, 4:6] = np.array([probe.body.velocity for probe in probes]) * 2 / WORLD
             now[:, 6] = [one.body.angle if one.body else 0.0 for one in tools]
-    contact[overlap] = 0
-    return states, contact
+    touched_at[overlap] = 0
+    return states, touched_at
 
 
 def _film(tool: Tool, trajectories: np.ndarray) -> np.ndarray:
@@ -1492,7 +1492,7 @@ def play(env: CreateEnv, seed: int = 0) -> None:
         show()
 
     def on_click(event) -> None:
-        """Left: choose a tool. Right: place it there."""
+        """In the menu: choose a tool. In the scene: place it."""
         nonlocal chosen
         if event.inaxes is menu:
             number = int(event.ydata) * columns + int(event.xdata)

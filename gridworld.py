@@ -18,7 +18,7 @@ understand a skill from recordings of it in another, larger and empty grid.
     python gridworld.py       # two episodes as text and GIFs; a PNG of layouts and skills (5 s)
     python gridworld.py --part train --num-available 10 --seed 3
 
-The sections bear A.1's names, in another order. [code] is what the authors' released implementation
+Sections have A.1's names (Reward: see `step`). [code] is what the authors' released implementation
 does, mostly followed where the appendix is silent; [here] is this repository's choice, with reason.
 """
 
@@ -71,7 +71,7 @@ SKILL_NAMES = ["".join(MOVE_NAMES[move] for move in moves) for moves in SKILL_MO
 
 def action_labels() -> np.ndarray:
     """The quadrant each skill leads to (the colours of Fig. 4): str (1024,), 256 of each."""
-    # No skill ends where it began: five is odd. Ties [code]: straight up counts as upper left,
+    # No skill ends where it began: dx + dy is odd. Ties [code]: straight up counts as upper left,
     # straight left as lower left, straight down as lower right, straight right as upper right.
     east, south = MOVE_DELTAS[SKILL_MOVES].sum(1).T  # (1024,) each: net displacement
     labels = np.full(NUM_ACTIONS, "upper right")
@@ -204,7 +204,7 @@ class GridWorldEnv(gym.Env):
             available=gym.spaces.Box(0, NUM_ACTIONS - 1, (num_available,), np.int64),
         )
         self.action_space = gym.spaces.Discrete(num_available)
-        self.over = True  # there is no episode to step in before the first reset
+        self.over = True  # so `step` is refused before the first reset
 
     def reset(self, *, seed=None, options=None):
         """Draw a layout and the available skills; returns (observation, {})."""
@@ -220,8 +220,8 @@ class GridWorldEnv(gym.Env):
 
         # Every episode has its own random subset of the pool: the paper's *subsampling*. [code]
         # draws it from the system's entropy; [here] the seeded generator, so a run can be repeated.
-        # The order is random, too: no matter for a policy that scores each skill by itself. A whole
-        # pool is sorted, so that a policy with one output per action meets each at the same place.
+        # A whole pool keeps its order, for a policy with one output per action. Else the order is
+        # random, too, which is no matter for a policy that scores each skill by itself.
         pool = self.action_pool
         self.available = pool
         if self.num_available < len(pool):
@@ -241,7 +241,7 @@ class GridWorldEnv(gym.Env):
         if not self.action_space.contains(action):
             raise ValueError(f"action is {action!r}; there are 0..{self.num_available - 1}")
 
-        # Walk. A move into a wall counts. Moves that were to follow after goal or lava do not.
+        # Walk. A move into a wall counts; those that goal or lava cut off do not.
         self.skill = int(self.available[action])
         self.skill_start = len(self.trace) - 1
         cells = walk(self.grid, self.trace[-1], self.skill)
@@ -262,7 +262,7 @@ class GridWorldEnv(gym.Env):
 
         # End (A.1): goal, lava, or the limit. [here] the limit is `truncated`, gymnasium's word for
         # an end that only a clock makes. Learning ignores the difference: [code] and
-        # ppo_actiongen.py bootstrap after neither. Ten skills are exactly 50 moves.
+        # ppo_actiongen.py bootstrap after neither. At the limit exactly ten skills were used.
         terminated = success or entered[-1] == LAVA
         truncated = not terminated and moves >= MAX_MOVES
         self.over = terminated or truncated
@@ -309,10 +309,10 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 
 # ---- A.1 Action Observations: the world of the recordings ----
-# hvae.py scales recordings: a first state becomes (cell - centre) / half_width, -1..1; differences
-# from it, or from the state before, are divided by step: cells [here]. The decoder's standard
-# deviation is at least 0.135 [code]. A move of 1 cell is 7 times that; scaled like a first state it
-# would be 1 / 39.5 = 0.025, too small to matter.
+# hvae.py scales a first state to (cell - centre) / half_width, about -1..1. A later one it takes as
+# the difference from the first, or from the one before, divided by `step`: in cells [here]. The
+# decoder's standard deviation is at least 0.135 [code]. A move of 1 cell is 7 times that; scaled
+# like a first state it would be 1 / 39.5 = 0.025, too small to matter.
 UNITS = dict(centre=39.5, half_width=39.5, step=1.0)
 
 
@@ -337,13 +337,13 @@ def action_observations(action_ids, num_observations=1024, modality="xy", seed=0
         rng = np.random.default_rng([seed, action])
         paths[i, :, 0] = rng.integers(PLAY_LOW, PLAY_HIGH + 1, (num_observations, 2))
 
-    # All recordings move at once, as int8, because a move can be -1. Clipping keeps an agent that
+    # All recordings move at once, in int8, since a move can be -1. Clipping keeps an agent that
     # would walk into the wall where it is.
     deltas = MOVE_DELTAS.astype(np.int8)[SKILL_MOVES[action_ids]]  # (A, 5, 2)
     for t in range(SKILL_LENGTH):
         after = paths[:, :, t] + deltas[:, None, t]  # (A, n, 2) + (A, 1, 2)
         paths[:, :, t + 1] = after.clip(PLAY_LOW, PLAY_HIGH)
-    return paths.view(np.uint8)  # the same bytes: all are 1..78
+    return paths.view(np.uint8)  # the same bytes (all are 1..78); other recordings are uint8, too
 
 
 # ---- pictures for people (Figure 1) ----

@@ -9,7 +9,7 @@ used in training. What is reported is the click-through rate (CTR): clicks / rec
         |                    +---------------------------+
         v                    v                           |
     a new user --> organic session (looks around) --> bandit session (one recommendation per step)
-                       stays: 0.74         0.25         stays: 0.94
+                       stays: 0.74      -- 0.25 ->      stays: 0.94
                          | 0.01                           | 0.01
                          v                                v
                         gone                             gone
@@ -22,7 +22,7 @@ recommendations the episode ends, too.
     python recsys.py --policy oracle --part train --num-available 50 --seed 3
     python recsys.py --episodes 10000   # what simple policies reach, as quoted at POLICIES (3 min)
 
-The sections bear A.2's names, in another order. [code] is what the authors' released implementation
+Sections have A.2's names, in another order. [code] is what the authors' released implementation
 does, mostly followed where the appendix is silent; [here] is this repository's choice, with reason.
 """
 
@@ -42,7 +42,7 @@ from PIL import Image
 # ---- constants (each with its source) ----
 NUM_ACTIONS = 10_000  # A.2 "a total of 10,000 actions (products)"
 DIM = 16  # A.2, Table 3: size of the user vector and of a product vector
-NUM_AVAILABLE = 500  # Table 3 "actions per episode"
+NUM_AVAILABLE = 500  # Table 3 "actions per episode"; [code] has 50 in validation, 25 in C.5's test
 MAX_RECOMMENDATIONS = 100  # A.2, Table 3 "max. episode length"
 SIGMA_1 = 0.1  # A.2: scale of one perturbation of the user
 MU_STD = 3.0  # [code]; the appendix does not say how mu_i is distributed
@@ -59,7 +59,7 @@ TRANSITIONS = np.array(
     [
         [0.74, 0.25, 0.01],  # from organic
         [0.05, 0.94, 0.01],  # from bandit
-        [0.00, 0.00, 1.00],  # from gone
+        [0.00, 0.00, 1.00],  # from gone: used only as `reset` explains
     ]
 )
 CUMULATIVE = TRANSITIONS.cumsum(1)  # (3, 3), for drawing the next session
@@ -75,7 +75,7 @@ PRODUCTS = _rng.standard_normal((NUM_ACTIONS, DIM))  # c_i
 
 # appendix: c ~ N(0, I), of length about 4; [code] scaled to length 1, and so [here]. For a user v,
 # call c_i . v the *taste* for product i, and mu_i its *popularity*. With length 4, taste (std 4)
-# would outweigh popularity (std 3), and little would be hidden; with 1, taste has std 1 at first.
+# would outweigh popularity (std 3), and little would be hidden; with 1, taste starts with std 1.
 PRODUCTS /= np.linalg.norm(PRODUCTS, axis=1, keepdims=True)
 POPULARITY = _rng.normal(0.0, MU_STD, NUM_ACTIONS)  # mu_i, hidden from the agent
 
@@ -133,7 +133,7 @@ def click_probability(x: np.ndarray) -> np.ndarray:
     def sigmoid(y):
         return 1.0 / (1.0 + np.exp(-y))
 
-    # With the constants of Eq. 2: a = 14, b = 2, c = 0.3 (which is not a product), d = 2, e = 6.
+    # With the constants of Eq. 2: a = 14, b = 2, c = 0.3 (not the vector c_i), d = 2, e = 6.
     return sigmoid(14.0 * sigmoid(2.0 * sigmoid(0.3 * x) - 2.0) - 6.0)
 
 
@@ -159,10 +159,10 @@ class RecSysEnv(gym.Env):
     uniformly from `action_pool` without replacement, and sorted.
 
     ## Episode End
-    `terminated` when the user leaves, at once or from an organic session (0.01 / (0.25 + 0.01) =
-    0.0385 of these end so): with probability 0.0385 after a click, else 0.01 + 0.05 * 0.0385 =
-    0.0119. A user gone before the first step still gets it, and a click brings them back.
-    `truncated` after 100. The last info holds `ctr`: clicks / recommendations, the mean reward.
+    `terminated` when the user leaves. An organic session ends so with probability 0.01 / (0.25 +
+    0.01) = 0.0385. So does a step after a click, which starts such a session; without a click it is
+    0.01 + 0.05 * 0.0385 = 0.0119. A user gone before the first step still gets it, and a click
+    brings them back. `truncated` after 100 steps. The last info holds `ctr`, clicks / steps.
 
     ## Arguments
     `action_pool`: distinct ids that `available` is drawn from (default: training products).
@@ -226,7 +226,7 @@ class RecSysEnv(gym.Env):
         # Click or not (Eq. 2), with the user vector that the agent has seen: it changes afterwards.
         # The appendix says that a product is unlikely to be clicked twice, because the user drifts.
         # That does not hold in [code], which has no rule against repeats, nor here: a policy that
-        # repeats the product that was best at the start loses less than 0.01 of the oracle's CTR
+        # repeats the product that was best at the start has a CTR less than 0.01 below the oracle's
         # (tests/test_recsys.py).
         product = self.available[action]
         x = PRODUCTS[product] @ self.user + POPULARITY[product]  # (16,) @ (16,) -> ()
@@ -236,9 +236,9 @@ class RecSysEnv(gym.Env):
         self.clicks.append(click)
         self.page_views.append(0)
 
-        # Next session. [code]: a click always leads to an organic session, even if "gone" was drawn
-        # (A.2 says only "can transition"). An organic session then runs until the user is back in
-        # the bandit session, or gone.
+        # Next session. The draw perturbs the user as well. [code]: a click always leads to an
+        # organic session, even if "gone" was drawn (A.2 says only "can transition"). That session
+        # then runs until the user is back in the bandit session, or gone.
         self._transition()
         if click:
             self.session = ORGANIC
@@ -288,7 +288,7 @@ class RecSysEnv(gym.Env):
         return draw_episode(self, len(self.clicks)) if self.render_mode else None
 
     def render_frames(self) -> list[np.ndarray]:
-        """Pictures of the last step: one; nothing moves in between. [] without a render_mode."""
+        """A list of one picture, after the last step; [] without a render_mode."""
         return [self.render()] if self.render_mode else []
 
 
@@ -315,8 +315,8 @@ def make_vec(num_envs, action_pool=None, num_available=NUM_AVAILABLE, seed=0, **
 
 # ---- floors and ceilings: what simple policies reach, to compare a trained one with ----
 # Each policy scores the available products, (K,), from taste c.v (K,) and popularity mu (K,); the
-# best is recommended. random is the floor. c-only knows c and v, not mu: while mu is hidden, and
-# c says nothing about it, the ceiling on unseen products (of a policy that remembers no clicks).
+# best is recommended. random is the floor. c-only knows c and v; with mu hidden it is the ceiling
+# on unseen products (for a policy that remembers no clicks), because c says nothing about mu.
 # mu-only ignores the user. The oracle recommends the likeliest click; it does not plan
 # ahead. The numbers are the CTR with 500 available test products (10,000 episodes, this script's
 # default seed, 5; standard errors up to 0.002).
@@ -346,7 +346,7 @@ def play(env: RecSysEnv, policy: str, rng: np.random.Generator, seed=None) -> fl
 
 
 def reference_ctr(policy, pool, num_available, episodes, seed=0) -> tuple:
-    """The metric of the paper, the mean of the episodes' CTR, and its standard error."""
+    """The paper's metric (the mean of the episodes' CTR) and its standard error."""
     env = RecSysEnv(pool, num_available)
     env.reset(seed=seed)
     rng = np.random.default_rng([seed, 1])  # for "random": not the environment's numbers
@@ -507,7 +507,6 @@ def main(args: Args) -> None:
     print()
     print(f"CTR of reference policies, {args.part} products, {args.episodes} episodes each:")
     print("available", *(f"{policy:>17}" for policy in POLICIES))
-    # Available: 500 (Table 3); [code] has 50 in every validation, 25 in the final test of C.5.
     for num_available in (25, 50, 500):
         print(f"{num_available:9}", end="")
         for policy in POLICIES:

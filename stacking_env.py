@@ -17,7 +17,7 @@ highest centre of mass (not top) when the agent stops or has acted ten times. At
 
 Paper map (appendix -> here):
     A.4 Actions, the 810 shapes   FAMILIES, SHAPES; StackingEnv.step
-    A.4 Action set split, Table 2 split_actions
+    A.4 Split, Table 2            split_actions
     A.4 State                     photograph, StackingEnv._observe
     A.4 Action observations, B    action_observations
     A.4 Reward, Eq. 4             eq4_reward
@@ -25,9 +25,8 @@ Paper map (appendix -> here):
     C.6, Fig. 13                  PLACEMENTS (No Place, 1D Place, 2D Place), split "full"
     Table 3 (20 actions, 10)      NUM_AVAILABLE, MAX_STEPS
 
-Two marks in the comments: [code] is the authors' released implementation (with another physics
-engine, MuJoCo), [here] is a choice of this repository. Alone, [code] marks what is taken over where
-the appendix is silent; in "[code] has ...; [here] ..." it is replaced.
+[code], the authors' released implementation (with another physics engine, MuJoCo), is followed
+where the appendix is silent; [here] is a choice of this repository, against [code] if both stand.
 """
 
 import colorsys
@@ -72,7 +71,7 @@ SPLITS = ("default", "full")  # A.4
 PLACEMENTS = {"none": 0, "1d": 1, "2d": 2}
 
 # ---- rules of the game (A.4) ----
-MAX_STEPS = 10  # A.4: "terminates after 10 shape placements"
+MAX_STEPS = 10  # A.4, Table 3 "max. episode length"; repeats, which place nothing, count, too
 NUM_AVAILABLE = 20  # Table 3, "actions per episode"
 LAMBDA_TOP = 0.5  # Eq. 4
 LAMBDA_AVG = 0.5  # Eq. 4
@@ -88,7 +87,7 @@ AXIS_GAP = (1.0, 1.6)  # m [code]: from one axis to the other
 SIM_STEPS = 300  # A.4: "acts every 300 physics simulator steps"
 # [code] has one density, so the largest shape is 1000 times as heavy as the smallest; [here] every
 # shape has mass 1 and the inertia of its form. Large ratios break Bullet's solver, which finds the
-# forces of contacts step by step: five cubes, each larger than the one below, then fall in 3 s.
+# forces of contacts step by step: five cubes, each larger than the one below, would fall in 3 s.
 MASS = 1.0
 # Friction between two bodies: [code] has 2 (sliding), 2 (spinning about the contact normal) and .25
 # (rolling), which is close to glue; [here] 1, .1 and .05, because spheres then come to rest, but
@@ -111,7 +110,7 @@ REST_DEPTH = 0.01  # m; an eighth of the thinnest shape
 # does not see the top of a higher tower.
 FRONT = ((0.0, -7.0, 2.5), (0.0, 0.0, 2.5))
 RAISED = ((0.0, -4.0, 5.5), (0.0, 1.66, 0.0))  # for 2D Place, where depth matters
-# Action observations are taken from a band around the shape [code]; 38 shapes exceed the picture.
+# Action observations are taken from a circle, at random heights [code]; 38 shapes exceed them.
 VIEW_RADIUS = 2.0  # m
 VIEW_HEIGHT = (0.5, 2.0)  # m
 # [here] The light comes from over the photographer's right shoulder: (right, up, back), of length
@@ -154,7 +153,7 @@ class Family:
 
     name: str  # [code]
     points: np.ndarray  # (V, 3) at scale 1, measured from the origin, the point that is placed
-    scales: tuple  # the smallest, the largest, how many; all times SCALE_FACTOR
+    scales: tuple  # (smallest, largest, how many); sizes are these times SCALE_FACTOR
     num_angles: int = 1
     turn: float = 0  # degrees: `num_angles` equally spaced angles in [0, turn)
     label: str = ""  # its class in Table 2, where that is not the name
@@ -170,8 +169,8 @@ class Family:
 
 # [code] A dome is half a cylinder that lies: half a circle in x and z, its flat side at z = -.5.
 HALF_CIRCLE = [(math.cos(a), math.sin(a) - 0.5) for a in np.linspace(0, math.pi, 13)]
-# A hat is `triangle`'s prism on its longest side; x and y swap, so that its ridge is along x. It
-# is scaled by sqrt 2, so that its short sides are 2 long, as those of `triangle`: one solid.
+# A hat is `triangle`'s prism on its longest side, its ridge along x. It is scaled by sqrt 2, so
+# that its short sides are 2 long, as those of `triangle`: one solid.
 HAT = prism((-1, 0), (1, 0), (0, 1))[:, [1, 0, 2]] * (1, math.sqrt(2), math.sqrt(2))
 CONE = np.vstack([ring(20, -1), (0, 0, 1)])
 # [code] draws a round tunnel through a block, but lets the full block collide; [here] the tunnel is
@@ -252,7 +251,7 @@ NUM_ACTIONS = len(SHAPES)  # A.4: 810
 
 
 def random_colour(rng: np.random.Generator) -> tuple:
-    """Red, green, blue in [0, 1]; A.4 mentions "random ... colors"."""
+    """Red, green, blue in [0, 1]; A.4: the cylinders have "random colors"."""
     # [code] has saturation and value of .5 to 1; [here] lighter, because the background is black.
     return colorsys.hsv_to_rgb(*rng.uniform((0.0, 0.35, 0.65), (1.0, 0.75, 1.0)))
 
@@ -310,7 +309,7 @@ def action_labels() -> np.ndarray:
 
 
 def engineered_representations() -> np.ndarray:
-    """In place of an encoder's: scale, sin, cos of the angle, one-hot family; (810, 19) float32."""
+    """Made by hand: scale, sin, cos of the angle, one-hot family; (810, 19) float32."""
     # [code] gives the angle itself (and an axis, always vertical); [here] a point on the circle, so
     # that 350 degrees is close to 0. Angles stop before the form repeats, so no form appears twice
     # within a family. Known flaw, as in [code]: a box at 162 degrees looks much like one at 0, but
@@ -337,15 +336,15 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
     # training shape of its family; all angles of a scale stay together. [code] draws per family;
     # [here] one draw decides for a solid (form and size) in all families that have it: else a cone
-    # would be in training and its copy, the other cone, in the test. What earlier
-    # families decided stays; of a family's other solids as many are drawn as bring half of it into
-    # training. So `cone-hires` draws half of its solids, and `cone` finds all of its own decided;
-    # `rectangle` shares one with `horizontal_rectangle`.
+    # would be in training and its copy, the other cone, in the test. What earlier families decided
+    # stays; then each family draws until half of its own solids are in training. So `cone-hires`
+    # draws half of its solids, and `cone` finds all of its own decided; `rectangle` shares one with
+    # `horizontal_rectangle`.
     decided = set()
     train_solids = set()
     for family in FAMILIES:
-        solids = [shape.solid_key() for shape in SHAPES if shape.family is family]
-        solids = list(dict.fromkeys(solids))  # each once
+        own = [shape.solid_key() for shape in SHAPES if shape.family is family]
+        solids = list(dict.fromkeys(own))  # each once
         undecided = [solid for solid in solids if solid not in decided]
         # Already in training are half of them, one, or none: `missing` is never negative.
         missing = len(solids) // 2 - len(train_solids.intersection(solids))
@@ -355,14 +354,14 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     train = np.array([shape.solid_key() in train_solids for shape in SHAPES])
 
     # Full Split (Table 2): the class alone decides. The draw above is thrown away here, but still
-    # made: it advances `rng`; without it the halves would differ from those in results/policies
-    # and results/*.csv. One solid can be on both sides: a `hat` is a `triangle` on another face.
+    # made: it advances `rng`; without it the halves would differ from those of saved results. One
+    # solid can be on both sides: a `hat` is a `triangle` on another face.
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
     # A.4: "randomly splitting the test set into half". The two cones are copies and must not be on
-    # both sides: shapes of one solid and angle form a group (so do some hats and triangles). Groups
-    # in random order go to validation where they still fit into its half, else to the test.
+    # both sides: one solid at one angle is a group (harmlessly, some hats and triangles, too).
+    # Groups in random order go to validation where they still fit into its half, else to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
     for shape_id in unseen:
@@ -381,6 +380,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 class Bullet:
     """One simulation: pybullet's functions, with the simulation's number already filled in."""
 
+    # (That of pybullet_utils prints a line for every simulation.)
     def __init__(self) -> None:
         self.client = p.connect(p.DIRECT)  # without a window
         weakref.finalize(self, p.disconnect, self.client)  # when nobody holds `self` any more
@@ -609,7 +609,8 @@ class StackingEnv(gym.Env):
         self._frames = []
         self._stack = np.zeros((FRAMES, SIZE, SIZE), dtype=np.uint8)  # black before the first one
 
-        # Two cylinders fall on the table, "of random heights" (A.4): one height for both [code].
+        # Two cylinders fall on the table. A.4: "of random heights"; [code], and so [here]: one
+        # height for both. They stand apart, so both start from the table, with top 0.
         cylinder = rng.choice(CYLINDERS)
         centre = rng.uniform(*CENTRE)
         gap = rng.uniform(*AXIS_GAP)
@@ -636,14 +637,14 @@ class StackingEnv(gym.Env):
 
         # A.4: "If a shape has already been placed, trying to place it again does nothing." The
         # starting cylinders may have the id of an available shape, which can still be placed.
-        # [here] A place beyond [-1, 1], which an unclipped Gaussian policy may ask for, also does
-        # nothing: clipped, it would be a place that the policy did not choose.
+        # [here] A place beyond [-1, 1] also does nothing: clipped, it would be one that the policy
+        # did not choose. (D.3.2's Beta policy stays within; a Gaussian one may not.)
         shape_id = self.available[choice]
         inside = (np.abs(position) <= 1).all()
 
         # Drop the shape and wait until the scene has settled. ([code] also waits when nothing was
-        # dropped.) Coordinates that the agent does not decide are 0, the table's centre (C.6).
-        # [code] What still moves after 300 steps is halted first; no measurable difference.
+        # dropped; [here] not.) Coordinates that the agent does not decide are 0, the table's centre
+        # (C.6). What still moves is halted before [code], which makes no measurable difference.
         if inside and shape_id not in self.shape_ids[2:] and not stop:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
@@ -674,7 +675,7 @@ class StackingEnv(gym.Env):
     def _drop(self, shape_id: int, x: float, y: float, top: float, rgb: tuple) -> None:
         """Let a shape go with its origin over (x, y) and its lowest point just above `top`."""
         # A.4: "calculated over the topmost shape, enabling a soft drop". [code] adds the radii of
-        # bounding spheres, and a flat slab falls by a metre; [here] exact, see `top`.
+        # bounding spheres, and a flat slab falls by a metre; [here] see `top`.
         family, scale, _ = SHAPES[shape_id]
         z = top + DROP_GAP - scale * family.points[:, 2].min()
         self._bodies.append(add_shape(self._bullet, shape_id, (x, y, z), rgb))
@@ -710,7 +711,7 @@ class StackingEnv(gym.Env):
         return np.array(centres), np.reshape(rotations, (-1, 3, 3))
 
     def top(self) -> float:
-        """Height of the highest point of the scene; of what is round, to about .01 m."""
+        """Height of the highest point; of what is round, to about .01 m (less than DROP_GAP)."""
         highest = 0.0
         for shape_id, centre, rotation in zip(self.shape_ids, *self.poses(), strict=True):
             # Turn the world's "up" into the shape's own frame, where `points` are given. World ->
@@ -771,7 +772,7 @@ def make_vec(
     make = functools.partial(StackingEnv, action_pool, num_available, **options)
     envs = AsyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
     # Unrelated seeds: with gymnasium's seed + i, runs with seeds 0 and 1 would share environments.
-    # This reset only seeds: call reset() without a seed for the first observation.
+    # This reset is for its seeds: call reset() without a seed for the first observation.
     envs.reset(seed=np.random.SeedSequence(seed).generate_state(num_envs).tolist())
     return envs
 
@@ -781,10 +782,10 @@ def _views(shape_id: int, num_views: int, seed: int) -> np.ndarray:
     """Pictures of one shape from random viewpoints, (num_views, 84, 84) uint8."""
     bullet = Bullet()
     add_shape(bullet, shape_id, (0, 0, 0), COLOURS[shape_id])
-    # Each shape has its own generator, and each view takes two numbers from it: view k depends only
-    # on the seed, the shape and k. The camera goes all the way round [code], the light with it, so
-    # turning the shape only shifts it along its circle: the pictures tell form and size, not the
-    # angle, which the policy sees only once the shape stands in the scene.
+    # Each view takes two numbers from its shape's own generator: view k depends only on the seed,
+    # the shape and k. The camera goes all the way round [code], the light with it, so turning the
+    # shape only shifts it along its circle: the pictures tell form, size and the shape's grey
+    # level, not the angle, which the policy sees only once the shape stands in the scene.
     rng = np.random.default_rng([seed, shape_id])
     pictures = []
     for _ in range(num_views):
@@ -870,7 +871,7 @@ def greedy_plan(available: Sequence[int]) -> list[int]:
     """Positions in `available` of at most ten shapes, in order, for a high tower.
 
     The shapes with flat top and bottom, largest first, then the tallest of the rest. If all are
-    dropped over one cylinder, the mean is 5.1 to 5.4 m, by the split; random play: 1.5 to 1.6.
+    dropped over one cylinder, the mean is 5.1 to 5.4 m (splits differ); random play: 1.5 to 1.6.
     """
 
     def rank(k):  # what is smaller comes first
@@ -894,7 +895,6 @@ def play(env: StackingEnv, seed: int, policy: str = "greedy") -> tuple[float, li
         rng = np.random.default_rng(seed)
         choices = rng.integers(env.num_available, size=MAX_STEPS)
         places = rng.uniform(-1, 1, (MAX_STEPS, 1))
-    info = {}
     frames = env.render_frames()
     # A plan for fewer than ten shapes begins anew: a shape that is placed only uses up the step.
     for choice, place in zip(itertools.cycle(choices), places, strict=False):
@@ -914,7 +914,6 @@ class Args:
 
 def main(args: Args) -> None:
     """The script: see the top of the file."""
-    args.out.mkdir(parents=True, exist_ok=True)
     parts = split_actions(args.split, args.seed)
     env = StackingEnv(parts["test"], render_mode="rgb_array")
     for policy in ("greedy", "random"):
