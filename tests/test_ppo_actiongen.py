@@ -42,7 +42,7 @@ def stand_in(state=VECTOR, action=None):
 
 def make_agent(action=None, state=VECTOR, **changes):
     """A small agent with a random table of 30 actions, 20 of them trained on, and its arguments."""
-    args = replace(ppo.PRESETS["gridworld"], **(dict(published_init=False) | changes))
+    args = replace(ppo.default_args(recipe="paper"), **(dict(published_init=False) | changes))
     table = np.random.default_rng(0).standard_normal((30, 4)).astype(np.float32)
     return ppo.Agent(stand_in(state, action), table, np.arange(20), args), args
 
@@ -421,10 +421,11 @@ def test_broken_and_foreign_checkpoints_are_refused_in_one_sentence(finished, tm
     with pytest.raises(UserError, match="outcome_coef"):
         ppo.load(tmp_path / "option")
     agent, _ = make_agent(hidden_size=16)
-    with pytest.raises(UserError, match="does not fit this script and its options: .*outcome"):
-        ppo.restore(dict(agent=agent.state_dict() | dict(outcome=torch.ones(2))), "x", agent=agent)
-    with pytest.raises(UserError, match="size mismatch for "):
-        ppo.restore(dict(agent=make_agent()[0].state_dict()), "x", agent=agent)
+    layer = student | dict(agent=agent.state_dict() | dict(outcome=torch.ones(2)))
+    for states, reason in ((layer, "Unexpected.*outcome"), (student, "size mismatch for ")):
+        torch.save(states, tmp_path / "student")
+        with pytest.raises(UserError, match=f"student is no checkpoint .*: {reason}"):
+            ppo.load(tmp_path / "student", agent=agent)
 
 
 def test_a_run_that_diverges_says_so(tmp_path):
@@ -725,11 +726,16 @@ def test_adaptation_is_to_the_whole_test_set_from_scratch_or_from_a_run(tmp_path
 # ---- torchrun ----
 JOINT = """import sys; sys.path[:0] = [{root!r}, {root!r} + "/tests"]
 import atexit, pathlib, ppo_actiongen as ppo, test_ppo_actiongen as test; ppo.join_processes()
-ppo.MAX_GRAD_NORM = 1e9
+ppo.MAX_GRAD_NORM, ppo.ppo_loss = 1e9, test.raw_loss
 test.torch.save(test.joint_update(ppo.RANK, ppo.WORLD_SIZE), {folder!r} + f"/{{ppo.RANK}}")
 ppo.dist.barrier(); atexit._run_exitfuncs(); test.time.sleep(1)  # no thread outlives it
 assert not any("gloo" in p.read_text() for p in pathlib.Path("/proc/self/task").glob("*/comm"))
 """
+
+
+def raw_loss(agent, mb, ent_coef, loss=ppo.ppo_loss):
+    """Without normalised advantages, which each process normalises by its own share."""
+    return loss(agent, mb | {"advantage": mb["raw"]}, ent_coef)
 
 
 def joint_update(rank, world, passes=2):
@@ -742,6 +748,7 @@ def joint_update(rank, world, passes=2):
     action, logprob, _, value = agent.act(state, sets)
     flat = dict(state=state, available=sets, logprob=logprob, value=value) | action
     flat |= {"advantage": 3 + torch.randn(T * N), "return": torch.randn(T * N)}
+    flat["raw"] = flat["advantage"]
     batch = {k: v.detach().unflatten(0, (T, N))[:, mine] for k, v in flat.items()}
     ppo.update(agent, torch.optim.SGD(agent.parameters(), 0.1), batch, 0.01)
     stats = ppo.RunningMeanStd((7,))
@@ -758,6 +765,7 @@ def test_advantages_are_normalised(monkeypatch):
 
 def test_two_processes_learn_what_one_learns_from_the_joint_batch(tmp_path, monkeypatch):
     monkeypatch.setattr(ppo, "MAX_GRAD_NORM", 1e9)  # it would hide a factor
+    monkeypatch.setattr(ppo, "ppo_loss", raw_loss)
     script = tmp_path / "joint.py"
     script.write_text(JOINT.format(root=str(ROOT), folder=str(tmp_path)))
     run(*TORCHRUN, script)

@@ -58,11 +58,10 @@ import shlex
 import sys
 import time
 from dataclasses import dataclass, replace
-from datetime import timedelta
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import gymnasium as gym
 import numpy as np
@@ -96,7 +95,7 @@ class Args:
     """Train on training actions, select on validation actions, test on unseen ones."""
 
     # --- experiment ---
-    env: Annotated[str, tyro.conf.Positional] = "gridworld"  # or recsys, create, stacking, FILE.py
+    env: tyro.conf.Positional[str] = "gridworld"  # or recsys, create, stacking, FILE.py
     recipe: Literal["fast", "paper"] = "fast"  # of the policy; fast: with FAST, below
     quick: bool = False  # the same protocol in minutes, with fewer steps
     method: Literal["utility", "nearest-neighbor", "continuous"] = "utility"  # or a baseline
@@ -161,9 +160,10 @@ class Args:
     resume: bool = False  # go on from the last checkpoint, bit for bit with as many processes
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
-    def __post_init__(self):
-        if self.finetune is not None:
-            self.adapt = True
+    @property
+    def module(self):
+        """The environment's file, imported."""
+        return hvae.load_environment(self.env)
 
 
 TABLE_3 = {
@@ -189,11 +189,6 @@ TABLE_3 = {
 # methods or tests: the continuous baseline's T = 256; without subsampling in CREATE six
 # minibatches; in the Recommender 50 available in validation, with `fully_observable` 25 in tests
 # and 80M steps; for C.2 10M steps in Grid World, 5M to 20M in CREATE.
-
-# Each column of the table, put over the defaults of Args, is the recipe `paper` of an environment.
-PRESETS = {}
-for number, environment in enumerate(TABLE_3["env"]):
-    PRESETS[environment] = Args(**{name: row[number] for name, row in TABLE_3.items()})
 
 AUX_ENT_SCALE = 0.1  # Table 3 "continuous entropy scaling"
 GAE_LAMBDA = 0.95  # [code]
@@ -260,8 +255,9 @@ def default_args(env="gridworld", recipe="fast", quick=False):
     An environment of your own may hold DEFAULTS, a dictionary of fields of Args.
     """
     module = hvae.load_environment(env)
-    if env in PRESETS:
-        args = PRESETS[env]
+    if env in TABLE_3["env"]:  # its column, put over the defaults of Args
+        column = TABLE_3["env"].index(env)
+        args = Args(**{name: row[column] for name, row in TABLE_3.items()})
     else:
         # The absolute path, so that `evaluate` and --resume find the file from everywhere.
         args = Args(env=str(Path(env).resolve()), **getattr(module, "DEFAULTS", {}))
@@ -281,7 +277,7 @@ def default_args(env="gridworld", recipe="fast", quick=False):
 
 # Started by `torchrun --nproc_per_node=2 ppo_actiongen.py ...`, each process (its number is RANK)
 # plays its share of the environments and learns from its share of every minibatch. Gradients are
-# averaged, so all processes keep the same weights. Rank 0 alone evaluates, writes and prints.
+# averaged, so all processes keep the same weights. Rank 0 alone evaluates and writes.
 RANK = int(os.environ.get("RANK", 0))
 WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 
@@ -293,17 +289,8 @@ def join_processes():
         # have been connected, Python can crash when it ends. So it is imported here, before.
         import torch.distributed.nn.functional as _  # noqa: F401
 
-        # The others may wait for hours while rank 0 trains an encoder.
-        dist.init_process_group("gloo", timeout=timedelta(days=3))
+        dist.init_process_group("gloo")
         atexit.register(dist.destroy_process_group)
-
-
-def gather_from_all(x):
-    """The objects `x` of all processes, in the order of their ranks."""
-    gathered = [x] * WORLD_SIZE
-    if WORLD_SIZE > 1:
-        dist.all_gather_object(gathered, x)
-    return gathered
 
 
 def sum_over_all(x):
@@ -757,9 +744,9 @@ def update(agent, optimizer, batch, ent_coef):
     """PPO's passes over one rollout; returns the numbers of the last minibatch."""
     # From here on it does not matter which step and which environment a row came from.
     flat = {name: x.flatten(0, 1) for name, x in batch.items()}  # (T, N, ...) -> (T * N, ...)
-    # Advantages are normalised over the whole rollout [code], with those of all processes.
-    advantages = torch.cat(gather_from_all(flat["advantage"].cpu()))
-    flat["advantage"] = (flat["advantage"] - advantages.mean()) / (advantages.std() + 1e-5)
+    # Advantages are normalised over the whole rollout [code] (of this process).
+    advantage = flat["advantage"]
+    flat["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-5)
     # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
     # the first step the policy is no longer the one that played, hence the ratio in ppo_loss.
     for epoch in range(agent.args.update_epochs + agent.args.head_epochs):
@@ -789,13 +776,16 @@ def train(args):
     # K of a test; "valid" and "test" have pools of their own (see action_phases).
     check(args)
     phases, train_ids = action_phases(args)
-    # 1. of Algorithm 1: the table of all c_i, made by the encoder. Rank 0 claims the run's folder,
-    # and loads the table or trains the encoder (load_table). The other processes wait for both.
-    made = (claim_folder(args), load_table(args)) if RANK == 0 else None
-    folder, table = gather_from_all(made)[0]  # [0]: what rank 0 has made
+    folder = Path(args.runs_dir) / run_name_of(args)
+    if RANK == 0:
+        claim_folder(folder, args)
+    # 1. of Algorithm 1: the table of all c_i, made by the encoder, which is trained if need be.
+    table = load_table(args)
 
-    # Environments, networks, optimiser.
-    device = choose_device(args)
+    # Environments, networks, optimiser. (Under torchrun, processes take the GPUs in turn.)
+    device = "cpu"
+    if args.device != "cpu" and torch.cuda.is_available():
+        device = f"cuda:{RANK % torch.cuda.device_count()}"
     N = args.num_envs // WORLD_SIZE
     envs, _ = make_envs(args, phases["learn"], N, (args.seed, TRAINING))
     torch.manual_seed(args.seed)  # the first weights, the same in all processes
@@ -813,9 +803,7 @@ def train(args):
     best_score = -math.inf
     log_size = 0  # bytes of metrics.csv at the checkpoint; `Log` cuts off the rest
     if args.resume and path.exists():
-        checkpoint = load(path)
-        restore(checkpoint, path, **learned)
-        step, seconds, best_score, log_size = checkpoint["progress"]
+        step, seconds, best_score, log_size = load(path, **learned)["progress"]
     log = Log(args, folder, step, log_size) if RANK == 0 else None
 
     rollout_size = args.minibatch_size * args.num_minibatches  # steps in a rollout
@@ -919,7 +907,7 @@ def train(args):
     # Test, once (Algorithm 2): the selected policy, frozen, on all parts of the split. The result
     # is its score with test actions, which it has never met. (In C.2 there is only "train", the
     # test actions, which it was adapted to.)
-    log.close()
+    log.bar.close()
     return finish(folder, agent, phases, step, seconds)
 
 
@@ -963,7 +951,7 @@ def ended_episodes(infos, args):
     # "final_info"; return and length are added by gymnasium's RecordEpisodeStatistics.
     if "episode" not in infos:
         return []
-    metric = hvae.load_environment(args.env).METRIC
+    metric = args.module.METRIC
     if metric not in infos.get("final_info", {}):
         raise UserError(f"the last info of an episode does not hold the metric {metric!r}")
     scores = infos["final_info"][metric]
@@ -979,7 +967,7 @@ def episode_means(episodes):
     return np.mean(episodes, axis=0)[1:].tolist()
 
 
-# ---- which actions are available; their representations; device; checks ----
+# ---- which actions are available; their representations; checks ----
 
 # Options that an environment's make_vec (see make_envs) takes, by their names in Args.
 # (`fully_observable` is none of them: it changes the representations, see load_table.)
@@ -999,8 +987,8 @@ def with_no_op(action_pool, args):
     No pool contains the no-op. CREATE adds it to every episode, as one of the K [code]. It has a
     representation like all others: of recordings in which nothing happens (see hvae.py).
     """
-    no_op = getattr(hvae.load_environment(args.env), "NO_OP", None)
-    return action_pool if no_op is None else np.union1d(action_pool, [no_op])
+    no_op = getattr(args.module, "NO_OP", action_pool[:0])  # or none
+    return np.union1d(action_pool, no_op)
 
 
 def make_envs(args, phase, num_envs, stream):
@@ -1009,8 +997,7 @@ def make_envs(args, phase, num_envs, stream):
     # seed. (Training seeds them anew, with RANK, at first and after every checkpoint.) Each
     # reset draws K ids, the no-op among them.
     action_pool, K = phase
-    make_vec = hvae.load_environment(args.env).make_vec
-    envs = make_vec(num_envs, action_pool, K, list(stream), **task_options(args))
+    envs = args.module.make_vec(num_envs, action_pool, K, list(stream), **task_options(args))
     envs = RecordEpisodeStatistics(envs)
     obs, _ = envs.reset()
     if not np.isin(obs["available"], with_no_op(action_pool, args)).all():
@@ -1023,8 +1010,8 @@ def action_phases(args):
 
     UserError if parts of the split overlap, or if a pool has fewer than K actions.
     """
-    split = hvae.load_environment(args.env).split_actions(args.split, args.split_seed)
-    ids = np.concatenate([split["train"], split["valid"], split["test"]])
+    split = args.module.split_actions(args.split, args.split_seed)
+    ids = np.concatenate(list(split.values()))
     if len(np.unique(ids)) < len(ids):
         raise UserError(f"parts of split {args.split!r} overlap: unseen actions would be seen")
 
@@ -1073,14 +1060,13 @@ def load_table(args):
     # Representations made by hand: an environment computes them from what it knows of its actions.
     # In Grid World: the moves and their sum [code]; with "engineered-5d" five numbers (appendix B).
     if args.representation.startswith("engineered"):
-        module = hvae.load_environment(args.env)
         options = {}
         if "-" in args.representation:
             options["variant"] = args.representation.partition("-")[2]
         if args.fully_observable:
             options["fully_observable"] = True
-        table = module.engineered_representations(**options)
-        hvae.check_table("engineered_representations", table, module)
+        table = args.module.engineered_representations(**options)
+        hvae.check_table("engineered_representations", table, args.module)
         return table
     # The encoder is trained on training actions only (but for "hvae-all"). Then it gives every
     # action a representation, the unseen ones, too: the mean of q(c | its recordings). One table
@@ -1104,10 +1090,9 @@ def load_table(args):
 
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
-    # With another split, the old policy would have been trained with some "new" actions. Options
-    # that decide the sizes of layers are not compared: `restore` names the layers that do not fit.
+    # With another split, the old policy would have been trained with some "new" actions.
     theirs = load(folder / "best.pt")
-    for name in ("env", "task", "method", "split", "split_seed"):
+    for name in ("env", "task", "method", "split", "split_seed", "hidden_size", "bilinear"):
         there = getattr(theirs["args"], name)
         if there != getattr(agent.args, name):
             raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
@@ -1117,29 +1102,21 @@ def start_from(agent, folder):
         for name, untrained in agent.state_dict().items():
             if name.startswith(("head.", "fc_stop.")):
                 theirs["agent"][name] = untrained
-    restore(theirs, folder, agent=agent)
-
-
-def choose_device(args):
-    """The device of --device; under torchrun, processes take the GPUs in turn."""
-    if args.device == "cpu" or not torch.cuda.is_available():
-        return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
+    agent.load_state_dict(theirs["agent"])  # other layers: an error that names them
 
 
 def check(args):
     """UserError, before anything is written, for the usual mistakes."""
     # Names that only some environments know; each lists its own.
-    module = hvae.load_environment(args.env)
     names = dict(split="SPLITS", task="TASKS", placement="PLACEMENTS")
     for option, allowed in names.items():
         value = getattr(args, option)
         if value is not None:
-            hvae.choose(option, value, getattr(module, allowed, ("default",)))
+            hvae.choose(option, value, getattr(args.module, allowed, ("default",)))
     if args.fully_observable and args.env != "recsys":
         raise UserError("fully_observable: only the Recommender hides something (C.5)")
     if not args.representation.endswith(".npz"):
-        variants = [f"engineered-{variant}" for variant in getattr(module, "VARIANTS", ())]
+        variants = [f"engineered-{variant}" for variant in getattr(args.module, "VARIANTS", ())]
         allowed = [*ENCODERS, "engineered", *variants, "FILE.npz"]
         hvae.choose("representation", args.representation, allowed)
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -1182,13 +1159,12 @@ def run_name_of(args):
     return re.sub(r"^\.|[^A-Za-z0-9._-]", "_", name)[:140]
 
 
-def claim_folder(args):
-    """The run's folder, new or to be resumed; no other process may write there as long as we live.
+def claim_folder(folder, args):
+    """Make the run's folder, or take it over; nobody else may write there as long as we live.
 
     UserError if another process does, if there is a checkpoint but no --resume, or if its options
     differ (mostly they give another name, so another folder).
     """
-    folder = Path(args.runs_dir) / run_name_of(args)
     folder.mkdir(parents=True, exist_ok=True)
     # Two processes in one folder would mix their rows. The operating system frees a lock when its
     # process ends, however it ends. Python would free it with the object `lock`, at the end of this
@@ -1208,30 +1184,24 @@ def claim_folder(args):
                 raise UserError(f"cannot resume {folder}: its {name} is {there!r}")
     elif args.resume:
         print(f"note: {folder} has no checkpoint, so a new run starts", flush=True)
-    return folder
 
 
-def load(path):
-    """A checkpoint, its "args" as Args; UserError if it is missing, damaged or of other code."""
+def load(path, **learned):
+    """A checkpoint, its "args" as Args; its states are copied into `learned` (agent=agent, ...).
+
+    UserError if it is missing, damaged, or of other code; it names an option or layer too many.
+    """
     try:
         # weights_only: numbers and names are read. A file from the internet could not run code.
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         checkpoint["args"] = Args(**checkpoint["args"])
+        for name, part in learned.items():
+            part.load_state_dict(checkpoint[name])
     except Exception as e:  # for damaged files torch has a dozen kinds of errors
-        reason = str(e).split("\n")[0]
+        reason = str(e).strip().split("\n")[-1].strip()
         hint = "the run's folder is expected"
         raise UserError(f"{path} is no checkpoint of this script, {hint}: {reason}") from None
     return checkpoint
-
-
-def restore(checkpoint, path, **learned):
-    """Copy a checkpoint's states into agent, optimiser, ...; UserError names what does not fit."""
-    for name, part in learned.items():
-        try:
-            part.load_state_dict(checkpoint[name])
-        except RuntimeError as e:
-            reason = str(e).split("\n")[-1].strip()
-            raise UserError(f"{path} does not fit this script and its options: {reason}") from None
 
 
 def append_row(path, row):
@@ -1262,8 +1232,9 @@ class Log:
         os.truncate(self.path, size)  # rows after the checkpoint are made again
         self.writer = SummaryWriter(folder, purge_step=step + 1)  # drops later events
         print(f"run: {folder}", flush=True)
-        steps = dict(total=args.total_timesteps, initial=step)
-        self.bar = tqdm(**steps, unit="step", unit_scale=True, disable=None)  # only on a terminal
+        # disable=None: no bar but on a terminal.
+        total = args.total_timesteps
+        self.bar = tqdm(total=total, initial=step, unit="step", unit_scale=True, disable=None)
 
     def write(self, row):
         """A row for one rollout, scores onto the screen; returns the size of metrics.csv."""
@@ -1273,23 +1244,18 @@ class Log:
                 self.writer.add_scalar(name, x, row["step"])
         self.bar.update(row["step"] - self.bar.n)
         if row["train_score"] is not None:
-            scores = "seen {train_score:.3f}, validation {valid_score:.3f}".format(**row)
-            self.bar.write(f"step {row['step']:,}: {scores}")
+            line = "step {step:,}: seen {train_score:.3f}, validation {valid_score:.3f}"
+            self.bar.write(line.format(**row))
             self.writer.flush()  # a checkpoint follows, and what is before it is not made again
         return self.path.stat().st_size
-
-    def close(self):
-        self.bar.close()
-        self.writer.close()
 
 
 def finish(folder, agent, phases, step, seconds):
     """Test the best checkpoint; write results.json; then print the scores and draw pictures."""
     # The last policy is forgotten; what is tested is the one that validation has selected.
     args = agent.args
-    best = load(folder / "best.pt")
-    restore(best, folder, agent=agent)
-    metric = hvae.load_environment(args.env).METRIC
+    best = load(folder / "best.pt", agent=agent)
+    metric = args.module.METRIC
     results = dict(metric=metric, seed=args.seed, command=shlex.join(sys.orig_argv))
     results.update(steps=step, best_step=best["step"], hours=seconds / 3600)
     for name in TESTED:
@@ -1332,7 +1298,7 @@ def record_episode(agent, phase, path):
     """Play one episode and save it as a GIF, in colour."""
     # The environment's class is the one that its file defines. One such environment is made, in
     # this process, and not reset at the end of the episode, or its last pictures would be lost.
-    module = hvae.load_environment(agent.args.env)
+    module = agent.args.module
     classes = [x for x in vars(module).values() if isinstance(x, type) and issubclass(x, gym.Env)]
     own = [x for x in classes if x.__module__ == module.__name__]
     env = own[0](*phase, render_mode="rgb_array", **task_options(agent.args))
@@ -1409,14 +1375,13 @@ def evaluate_run(options):
     folder = Path(options.run)
     best = load(folder / "best.pt")
     args = best["args"]
-    module = hvae.load_environment(args.env)
     phases, train_ids = action_phases(args)
     # The pool and K of the run's own test, and what the options change of them (A.3: "the rest of
     # the tools"; [here] without the part that selects). A policy that was adapted (C.2) knows one
     # fixed set, which is called "train".
     part = "train" if args.adapt else options.actions
     pool, K = phases[part]
-    pool = restrict_pool(options, module, best["agent"]["table"], pool, phases["learn"][0])
+    pool = restrict_pool(options, args.module, best["agent"]["table"], pool, phases["learn"][0])
     if options.num_available is not None:
         K = options.num_available
     phase = (pool, K)
@@ -1427,11 +1392,11 @@ def evaluate_run(options):
     envs, _ = make_envs(args, phase, 1, stream)  # for its spaces, which shape the networks
     agent = Agent(envs, best["agent"]["table"].numpy(), train_ids, args)
     envs.close()
-    restore(best, folder, agent=agent)
+    load(folder / "best.pt", agent=agent)
     result = evaluate(agent, phase, options.episodes, stream)
     most = len(with_no_op(pool, args))
     print(f"{part}: {K} of {most} actions available, {options.episodes} episodes")
-    print(module.METRIC + " {score:.4f} +- {stderr:.4f}".format(**result))
+    print(args.module.METRIC + " {score:.4f} +- {stderr:.4f}".format(**result))
     if options.save:
         # `best_step` tells which checkpoint was scored: an unfinished run may still find a better.
         row = dict(vars(options), actions=part, num_available=K, pool_size=len(pool), **result)
@@ -1453,7 +1418,7 @@ def parse_args(words):
     first = tyro.cli(Args, args=[word for word in words if word not in ("-h", "--help")])
     default = default_args(first.env, first.recipe, first.quick)
     args = tyro.cli(Args, args=words, default=default, description=__doc__)
-    return replace(args, env=default.env)
+    return replace(args, env=default.env, adapt=args.adapt or args.finetune is not None)
 
 
 def main(words):
