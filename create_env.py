@@ -44,7 +44,6 @@ Every split divides these, too (see `split_actions`), and no other tool changes 
 a ball is a contact rule (`make_space`). If a rule raises, pymunk prints the exception and goes on.
 """
 
-import io
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -1382,19 +1381,14 @@ def _film(tool: Tool, trajectories: np.ndarray) -> np.ndarray:
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
     """Write pictures (h, w, 3) uint8 as a GIF that rests on its last one; all of it or no file."""
-    data = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
     durations = [round(1000 / fps)] * len(pictures)  # ms
     durations[-1] = 2000  # so that the end can be seen
-    pictures[0].save(
-        data, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
-    )
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    try:
-        Path(path).write_bytes(data.getvalue())
-    except OSError:
-        Path(path).unlink(missing_ok=True)
-        raise
+    # If this fails, on a full disk for instance, Pillow removes what it has begun.
+    pictures[0].save(
+        path, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
+    )
 
 
 def play_episode(env: CreateEnv, seed: int) -> tuple[list[np.ndarray], float, bool]:

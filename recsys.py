@@ -26,7 +26,6 @@ Sections have A.2's names, in another order. [code] is what the authors' release
 does, mostly followed where the appendix is silent; [here] is this repository's choice, with reason.
 """
 
-import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -459,19 +458,14 @@ def draw_click_curve(path: Path, available: np.ndarray, seed: int):
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
     """Write pictures (h, w, 3) uint8 as a GIF that rests on its last one; all of it or no file."""
-    data = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
     durations = [round(1000 / fps)] * len(pictures)  # ms
     durations[-1] = 2000  # so that the end can be seen
-    pictures[0].save(
-        data, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
-    )
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    try:
-        Path(path).write_bytes(data.getvalue())
-    except OSError:
-        Path(path).unlink(missing_ok=True)
-        raise
+    # If this fails, on a full disk for instance, Pillow removes what it has begun.
+    pictures[0].save(
+        path, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
+    )
 
 
 # ---- the script ----

@@ -26,12 +26,12 @@ Paper map (appendix -> here):
     Table 3 (20 actions, 10)      NUM_AVAILABLE, MAX_STEPS
 
 [code], the authors' released implementation (with another physics engine, MuJoCo), is followed
-where the appendix is silent; [here] is a choice of this repository, against [code] if both stand.
+where the appendix is silent; [here] is a choice of this repository, and replaces [code] where both
+are named.
 """
 
 import colorsys
 import functools
-import io
 import itertools
 import math
 import multiprocessing
@@ -59,7 +59,7 @@ except ModuleNotFoundError:
         "Shape Stacking needs pybullet, which pip has ready-made for x86 Linux, Python 3.11; "
         "for others conda-forge has it: conda install -c conda-forge pybullet"
     )
-    # The script ends with the sentence alone; hvae.py, which imports it, catches the exception.
+    # The script ends with the sentence alone; hvae.py imports this file, and catches the exception.
     error = SystemExit if __name__ == "__main__" else ModuleNotFoundError
     raise error(sentence) from None
 
@@ -71,7 +71,7 @@ SPLITS = ("default", "full")  # A.4
 PLACEMENTS = {"none": 0, "1d": 1, "2d": 2}
 
 # ---- rules of the game (A.4) ----
-MAX_STEPS = 10  # A.4, Table 3 "max. episode length"; repeats, which place nothing, count, too
+MAX_STEPS = 10  # Table 3 "max. episode length" [code]; A.4: 10 "placements", but repeats count
 NUM_AVAILABLE = 20  # Table 3, "actions per episode"
 LAMBDA_TOP = 0.5  # Eq. 4
 LAMBDA_AVG = 0.5  # Eq. 4
@@ -110,7 +110,7 @@ REST_DEPTH = 0.01  # m; an eighth of the thinnest shape
 # does not see the top of a higher tower.
 FRONT = ((0.0, -7.0, 2.5), (0.0, 0.0, 2.5))
 RAISED = ((0.0, -4.0, 5.5), (0.0, 1.66, 0.0))  # for 2D Place, where depth matters
-# Action observations are taken from a circle, at random heights [code]; 38 shapes exceed them.
+# Action observations are taken from a circle, at random heights [code]; 38 shapes do not fit.
 VIEW_RADIUS = 2.0  # m
 VIEW_HEIGHT = (0.5, 2.0)  # m
 # [here] The light comes from over the photographer's right shoulder: (right, up, back), of length
@@ -169,8 +169,8 @@ class Family:
 
 # [code] A dome is half a cylinder that lies: half a circle in x and z, its flat side at z = -.5.
 HALF_CIRCLE = [(math.cos(a), math.sin(a) - 0.5) for a in np.linspace(0, math.pi, 13)]
-# A hat is `triangle`'s prism on its longest side, its ridge along x. It is scaled by sqrt 2, so
-# that its short sides are 2 long, as those of `triangle`: one solid.
+# A hat is `triangle`'s prism on its longest side, its ridge along x. y and z are scaled by sqrt 2,
+# so that its short sides are 2 long, as those of `triangle`: one solid.
 HAT = prism((-1, 0), (1, 0), (0, 1))[:, [1, 0, 2]] * (1, math.sqrt(2), math.sqrt(2))
 CONE = np.vstack([ring(20, -1), (0, 0, 1)])
 # [code] draws a round tunnel through a block, but lets the full block collide; [here] the tunnel is
@@ -251,7 +251,7 @@ NUM_ACTIONS = len(SHAPES)  # A.4: 810
 
 
 def random_colour(rng: np.random.Generator) -> tuple:
-    """Red, green, blue in [0, 1]; A.4: the cylinders have "random colors"."""
+    """Red, green, blue in [0, 1]; A.4: cylinders of "random heights and colors"."""
     # [code] has saturation and value of .5 to 1; [here] lighter, because the background is black.
     return colorsys.hsv_to_rgb(*rng.uniform((0.0, 0.35, 0.65), (1.0, 0.75, 1.0)))
 
@@ -309,7 +309,7 @@ def action_labels() -> np.ndarray:
 
 
 def engineered_representations() -> np.ndarray:
-    """Made by hand: scale, sin, cos of the angle, one-hot family; (810, 19) float32."""
+    """Ground truth, to compare with: scale, sin, cos of angle, one-hot family; (810, 19)."""
     # [code] gives the angle itself (and an axis, always vertical); [here] a point on the circle, so
     # that 350 degrees is close to 0. Angles stop before the form repeats, so no form appears twice
     # within a family. Known flaw, as in [code]: a box at 162 degrees looks much like one at 0, but
@@ -334,12 +334,12 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     rng = np.random.default_rng(seed)
 
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
-    # training shape of its family; all angles of a scale stay together. [code] draws per family;
-    # [here] one draw decides for a solid (form and size) in all families that have it: else a cone
-    # would be in training and its copy, the other cone, in the test. What earlier families decided
-    # stays; then each family draws until half of its own solids are in training. So `cone-hires`
-    # draws half of its solids, and `cone` finds all of its own decided; `rectangle` shares one with
-    # `horizontal_rectangle`.
+    # training shape of its family; all angles of a scale stay together. (A.4: of its class,
+    # but some classes have two families.) [code] draws per family; [here] one draw decides for a
+    # solid (form and size) in all families that have it: else a cone would be in training and its
+    # copy, the other cone, in the test. What earlier families decided stays; then each family draws
+    # until half of its own solids are in training. So `cone-hires` draws half of its solids, and
+    # `cone` finds all of its own decided; `rectangle` shares one with `horizontal_rectangle`.
     decided = set()
     train_solids = set()
     for family in FAMILIES:
@@ -360,7 +360,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
     # A.4: "randomly splitting the test set into half". The two cones are copies and must not be on
-    # both sides: one solid at one angle is a group (harmlessly, some hats and triangles, too).
+    # both sides: one solid at one angle is a group (as are some hats and triangles: no harm).
     # Groups in random order go to validation where they still fit into its half, else to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
@@ -372,15 +372,15 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     for k in rng.permutation(len(groups)):
         if len(valid) + len(groups[k]) <= len(unseen) // 2:
             valid += groups[k]
-    parts = {"train": np.flatnonzero(train), "valid": np.sort(valid)}
-    return parts | {"test": np.setdiff1d(unseen, valid)}
+    test = np.setdiff1d(unseen, valid)
+    return {"train": np.flatnonzero(train), "valid": np.sort(valid), "test": test}
 
 
 # ---- what Bullet simulates and draws ----
 class Bullet:
     """One simulation: pybullet's functions, with the simulation's number already filled in."""
 
-    # (That of pybullet_utils prints a line for every simulation.)
+    # (pybullet_utils.bullet_client has one, too, but it prints a line per simulation.)
     def __init__(self) -> None:
         self.client = p.connect(p.DIRECT)  # without a window
         weakref.finalize(self, p.disconnect, self.client)  # when nobody holds `self` any more
@@ -644,7 +644,7 @@ class StackingEnv(gym.Env):
 
         # Drop the shape and wait until the scene has settled. ([code] also waits when nothing was
         # dropped; [here] not.) Coordinates that the agent does not decide are 0, the table's centre
-        # (C.6). What still moves is halted before [code], which makes no measurable difference.
+        # (C.6). [code] First halts what still moves; it makes no measurable difference.
         if inside and shape_id not in self.shape_ids[2:] and not stop:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
@@ -701,7 +701,8 @@ class StackingEnv(gym.Env):
                 return False
         # A thin shape can enter the table when it hits it. Bullet pushes it out too slowly to count
         # as moving. contact[8] is the distance of the two bodies, below 0 if they overlap.
-        return all(contact[8] > -REST_DEPTH for contact in self._bullet.getContactPoints())
+        contacts = self._bullet.getContactPoints()
+        return all(contact[8] > -REST_DEPTH for contact in contacts)
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres of mass (n, 3), rotations body -> world (n, 3, 3), ordered as `shape_ids`."""
@@ -784,14 +785,16 @@ def _views(shape_id: int, num_views: int, seed: int) -> np.ndarray:
     add_shape(bullet, shape_id, (0, 0, 0), COLOURS[shape_id])
     # Each view takes two numbers from its shape's own generator: view k depends only on the seed,
     # the shape and k. The camera goes all the way round [code], the light with it, so turning the
-    # shape only shifts it along its circle: the pictures tell form, size and the shape's grey
+    # shape is the same as moving the camera: the pictures tell form, size and the shape's grey
     # level, not the angle, which the policy sees only once the shape stands in the scene.
     rng = np.random.default_rng([seed, shape_id])
     pictures = []
     for _ in range(num_views):
         angle = rng.uniform(0, 2 * math.pi)
         height = rng.uniform(*VIEW_HEIGHT)
-        eye = (VIEW_RADIUS * math.cos(angle), VIEW_RADIUS * math.sin(angle), height)
+        x = VIEW_RADIUS * math.cos(angle)
+        y = VIEW_RADIUS * math.sin(angle)
+        eye = (x, y, height)
         pictures.append(grey(photograph(bullet, (eye, (0, 0, 0)))))  # it looks at the origin
     return np.stack(pictures)
 
@@ -841,7 +844,8 @@ def shape_sheet() -> Image.Image:
         ids += [own[len(own) // 2], own[-1]]
     # Twelve pictures of a family in a row: (family, picture, y, x) -> (family, y, picture, x).
     views = action_observations(ids, 6).reshape(len(FAMILIES), 12, SIZE, SIZE)
-    sheet = Image.fromarray(views.swapaxes(1, 2).reshape(-1, 12 * SIZE))
+    rows = views.swapaxes(1, 2).reshape(-1, 12 * SIZE)  # (families * y, pictures * x)
+    sheet = Image.fromarray(rows)
     for row, family in enumerate(FAMILIES):
         ImageDraw.Draw(sheet).text((4, SIZE * row), family.name, 255)
     return sheet
@@ -849,32 +853,27 @@ def shape_sheet() -> Image.Image:
 
 def save_gif(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
     """Write pictures (h, w, 3) uint8 as a GIF that rests on its last one; all of it or no file."""
-    data = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
     durations = [round(1000 / fps)] * len(pictures)  # ms
     durations[-1] = 2000  # so that the end can be seen
-    pictures[0].save(
-        data, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
-    )
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    try:
-        Path(path).write_bytes(data.getvalue())
-    except OSError:
-        Path(path).unlink(missing_ok=True)
-        raise
+    # If this fails, on a full disk for instance, Pillow removes what it has begun.
+    pictures[0].save(
+        path, "gif", append_images=pictures[1:], save_all=True, duration=durations, loop=0
+    )
 
 
 FLAT = ("horizontal_rectangle", "half_rectangle", "cube", "arch", "rectangle", "cylinder")
 
 
 def greedy_plan(available: Sequence[int]) -> list[int]:
-    """Positions in `available` of at most ten shapes, in order, for a high tower.
+    """Indices into `available` of at most ten shapes, in order, for a high tower.
 
     The shapes with flat top and bottom, largest first, then the tallest of the rest. If all are
     dropped over one cylinder, the mean is 5.1 to 5.4 m (splits differ); random play: 1.5 to 1.6.
     """
 
-    def rank(k):  # what is smaller comes first
+    def rank(k):  # the lowest comes first
         family, scale, _ = SHAPES[available[k]]
         width, depth, height = scale * np.ptp(family.points, axis=0)
         if family.name in FLAT:

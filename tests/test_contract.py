@@ -254,11 +254,11 @@ def test_a_gif_rests_on_its_end_and_appears_whole_or_not_at_all(module, tmp_path
         picture.seek(1)
         assert picture.info["duration"] == 2000
 
-    def full_disk(path, data):
-        path.open("wb").write(data[:9])
+    def full_disk(picture, file, name):
+        file.write(b"GIF89a")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full_disk)
+    monkeypatch.setitem(Image.SAVE_ALL, "GIF", full_disk)
     with pytest.raises(OSError):
         module.save_gif(tmp_path / "b.gif", frames, fps=10)
     assert [p.name for p in tmp_path.rglob("*.*")] == ["a.gif"]
