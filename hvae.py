@@ -33,10 +33,10 @@ NO_OP (an id), UNITS (see `prepare`); and
 
 An observation is (L, F), L states of F numbers each. Of modality "onehot" it is (L, 2), a cell's x
 and y as whole numbers 0-79, at most 39 from those of the first state and of the state before. Of
-"image" it is (S, S), of "video" (L, S, S), greys 0-255, S 48 or 84. Random numbers must depend on
-seed *and* id: several calls are made, each may start `workers` processes.
+"image" it is (S, S), of "video" (L, S, S), greys 0-255, S 48 or 84. Each action's random
+numbers follow from (seed, id): a call, or one of its `workers` processes, gets only some ids.
 Marks: "appendix", that of Generalization to New Actions in RL (ICML 2020); [code], the authors'
-program; [here], our choice, and why. The last of those that stand is what this file does.
+program; [here], our choice, and why. Where several are named, the file does the last.
 """
 
 import hashlib
@@ -109,7 +109,7 @@ class Args:
 
 # Args explains the rows. "paper" has the tables' numbers (pictures, videos: see below); "fast", the
 # default, takes minutes on a CPU, more for pictures; "quick" is shorter, or the same. Counts, rates
-# of both are [here]: tried by hand, judged by `probe` on held-out actions (D.2.1: validation's).
+# of both [here] are tuned by hand, by `probe` of all held-out actions (D.2.1: validation's).
 # fmt: off
 HYPERPARAMETERS = {  # of Grid World and files of your own; columns: quick, fast, paper
     "representation_size": (16,    16,    16),      # Table 3
@@ -139,8 +139,8 @@ HYPERPARAMETERS = {  # of Grid World and files of your own; columns: quick, fast
 # In place of rows above: the entry of the modality or, if there is none, of the environment.
 EXCEPTIONS = {
     "onehot": {"updates": (2_000, 4_000, 0)},  # it takes longer to learn what 160 numbers mean
-    # Before rates, counts and KL weights were changed, together, the model ignored z (how the ball
-    # was launched): the squared error, in units of `step` (see prepare), stayed near 6.5; now < 1.
+    # Before these rows had their numbers (all at once), the model ignored z, how the ball had been
+    # launched: the squared error, in units of `step` (see prepare), stayed near 6.5; now < 1.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
@@ -157,7 +157,7 @@ EXCEPTIONS = {
         "epochs":              (0,     0,     5_000),   # Table 3
         "hidden":              (128,   128,   128),     # appendix: 64; [code] and [here] 128
         "learning_rate":       (2e-3,  2e-3,  1e-3),
-        "batch_observations":  (4,     4,     52),      # [code]: 5 GB; 1,024: in proportion 94
+        "batch_observations":  (4,     4,     52),      # [code]: 4.8 GB; 1,024: 94 in proportion
         "kl_c_divisor":        (1024,  1024,  52),      # fast: as in CREATE
         "kl_warmup":           (0.5,   0.5,   0.0),
         "updates":             (1_000, 1_500, 0),
@@ -216,7 +216,7 @@ def default_args(env: str, recipe: str = "fast", modality: str | None = None) ->
         raise UserError(f"{env} has no action observations, only engineered representations")
     modality = modality or module.MODALITIES[0]
     choose("modality", modality, module.MODALITIES)
-    table = HYPERPARAMETERS | EXCEPTIONS.get(modality, EXCEPTIONS.get(environment_name(env), {}))
+    table = HYPERPARAMETERS | EXCEPTIONS.get(modality, EXCEPTIONS.get(env, {}))
     numbers = {name: row[RECIPES.index(recipe)] for name, row in table.items()}
     return Args(env=env, modality=modality, recipe=recipe, **numbers)
 
@@ -243,8 +243,8 @@ def prepare(raw, args):
     if args.modality == "onehot":
         # The input has 80 zeros and ones for x and for y, the target one class number for each.
         if args.relative:
-            # Of a later state class 40 is "no change", 41 one cell right or down: from the state
-            # before in the input, from the first state in the target.
+            # Later states become offsets + 40 (class 40: no change): from the state before in the
+            # input, from the first state in the target.
             raw = torch.cat([first, moves + CLASSES // 2], 1)
             later = later - first + CLASSES // 2
         one_hot = nn.functional.one_hot(raw.long(), CLASSES)  # (B, L, 2, 80)
@@ -291,8 +291,8 @@ class SumReLU(nn.Module):
 class GlobalBatchNorm(nn.BatchNorm1d):
     """One mean, variance, gain and bias over batch *and* dimensions."""
 
-    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. A norm per dimension would at
-    # first spread the means of an unused dimension of c to variance 1: a KL; here they stay small.
+    # D.3.1: "1D batch-norm"; [code] this one, its eps and momentum. A norm per dimension would
+    # blow up the means of an unused dimension of c to variance 1, which costs KL.
     def __init__(self):
         super().__init__(num_features=1, eps=0.001, momentum=0.01)
 
@@ -369,7 +369,7 @@ class ActionInference(nn.Module):
 class ObservationInference(nn.Module):
     """Observation Inference Network: encoded x (B, E), c (B, C) -> q(z | x, c), Gaussian (B, Z)."""
 
-    # A second one, without x, is p(z | c) [code]; the VAE's is without c. The batch norm: [code].
+    # Without x it is p(z | c) [code], without c the VAE's q(z | x). The batch norm: [code].
     def __init__(self, inputs, hidden, size):
         super().__init__()
         self.sum = SumReLU(inputs, hidden)

@@ -157,7 +157,7 @@ class Args:
     # --- run ---
     runs_dir: str = "runs"  # folder of runs and representations
     run_name: str | None = None  # name of the run's folder; None: see run_name_of
-    resume: bool = False  # go on from the last checkpoint, bit for bit with as many processes
+    resume: bool = False  # go on from the last checkpoint; the same bits if started the same way
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
     @property
@@ -185,8 +185,8 @@ TABLE_3 = {
     # As in [code]; but for Stacking 200, not 40, which cannot tell checkpoints apart [here].
     "valid_episodes": (640, 160, 640, 200),
 }
-# Not used [here], so that all methods are compared alike, are [code]'s other numbers for single
-# methods or tests: the continuous baseline's T = 256; without subsampling in CREATE six
+# [code] has other numbers for single methods or tests, which we do not use, so that all methods are
+# compared alike [here]: the continuous baseline's T = 256; without subsampling in CREATE six
 # minibatches; in the Recommender 50 available in validation, with `fully_observable` 25 in tests
 # and 80M steps; for C.2 10M steps in Grid World, 5M to 20M in CREATE.
 
@@ -226,7 +226,7 @@ FAST = {
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
-        head_epochs=3,  # three more without f_omega: one is too few for the layers after it
+        head_epochs=3,  # the layers after f_omega need more: three passes of their own
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
         clip_coef=0.2,  # goals are rare, so each of them may teach more
@@ -555,9 +555,9 @@ class Agent(nn.Module):
         if self.args.method == "utility":
             return drawn
         # A baseline takes the available action nearest to the training action, or to the point,
-        # that was drawn. The loss takes the probability of what was drawn; the look-up is as if the
-        # environment did it (only the position of C.4 depends on it). While nearest-neighbor is
-        # trained, all training actions are available, so it gets what it drew.
+        # that was drawn. PPO sees the draw and its probability; the look-up counts as a part of the
+        # environment (but C.4's position reads its result). While nearest-neighbor is trained, all
+        # training actions are available, so it gets what it drew.
         if self.args.method == "nearest-neighbor":
             drawn = self.table[self.train_ids[drawn]]  # (B,) -> (B, D)
         difference = self.table[available] - drawn[:, None]  # (B, K, D) - (B, 1, D)
@@ -880,8 +880,8 @@ def train(args):
             if valid_score > best_score:
                 best_score = valid_score
                 best = dict(args=vars(args), step=step, agent=agent.state_dict())
-                # hvae.write lets torch.save fill a temporary file, and renames it when it is whole:
-                # a process that is killed leaves no half file.
+                # hvae.write puts the new file in the place of the old one when it is whole: a
+                # process that is killed leaves no half file.
                 hvae.write(folder / "best.pt", partial(torch.save, best))
 
         # Record what happened (under torchrun: to the environments of rank 0).
@@ -918,7 +918,7 @@ def evaluate(agent, phase, episodes, stream):
     """The frozen policy with actions of a phase, (action_pool, K): means over `episodes` episodes.
 
     At every reset K actions of the pool become available. Their c_i are rows of the table. Actions
-    are drawn from pi, as in training, not the likeliest taken [code]. Nothing is learned here.
+    are drawn from pi, as in training, not the argmax [code]. Nothing is learned here.
     `stream` names the random numbers, see `seeds`. Returns score, its standard error over episodes
     (published error bars are over 5 seeds, 8 in Grid World, instead), return, length, episodes.
     """
@@ -1027,9 +1027,9 @@ def action_phases(args):
     # Three cases learn with a fixed set instead, all of it available all the time, and "train"
     # scores them on it: nearest neighbour, the ablation without subsampling, and C.2 [code]. Where
     # the utilities would cost too much, fixed_set_size makes the set smaller [code]; nearest
-    # neighbour, whose outputs are cheap, keeps all of it. (C.2 is compared with zero-shot scores:
-    # evaluate the run that was not adapted, with the size of this set as --num-available. A set
-    # smaller than the pool is then another one in each episode.)
+    # neighbour, whose outputs are cheap, keeps all of it. (C.2 is compared with a zero-shot
+    # score: evaluate the run that was not adapted on as many actions, by --num-available. If these
+    # are fewer than the pool, each episode draws others.)
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
@@ -1090,9 +1090,11 @@ def load_table(args):
 
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
-    # With another split, the old policy would have been trained with some "new" actions.
+    # With another split, the old policy would have been trained with some "new" actions. Its
+    # representations are taken over, too; the other options decide layers.
     theirs = load(folder / "best.pt")
-    for name in ("env", "task", "method", "split", "split_seed", "hidden_size", "bilinear"):
+    names = "env task method split split_seed representation hidden_size bilinear aux_conditioned"
+    for name in names.split():
         there = getattr(theirs["args"], name)
         if there != getattr(agent.args, name):
             raise UserError(f"{folder} cannot be fine-tuned: its {name} is {there!r}")
@@ -1189,7 +1191,7 @@ def claim_folder(folder, args):
 def load(path, **learned):
     """A checkpoint, its "args" as Args; its states are copied into `learned` (agent=agent, ...).
 
-    UserError if it is missing, damaged, or of other code; it names an option or layer too many.
+    UserError if it is missing, damaged, or of other code; then it names the option or layer.
     """
     try:
         # weights_only: numbers and names are read. A file from the internet could not run code.
@@ -1377,7 +1379,7 @@ def evaluate_run(options):
     args = best["args"]
     phases, train_ids = action_phases(args)
     # The pool and K of the run's own test, and what the options change of them (A.3: "the rest of
-    # the tools"; [here] without the part that selects). A policy that was adapted (C.2) knows one
+    # the tools"; [here] without the validation part). A policy that was adapted (C.2) knows one
     # fixed set, which is called "train".
     part = "train" if args.adapt else options.actions
     pool, K = phases[part]
