@@ -135,8 +135,8 @@ class Kind(NamedTuple):
     contact: int = PLAIN
     sides: int = 0  # of polygons
     radius: float = 1.0  # units, of segments: [code]'s thickness // 2, so 0 or 1
-    # Degrees after which the shape is the same again: angles stay below. For see-saws a bound on
-    # their limits: [code] 60 with a weight, 90 without.
+    # Degrees after which the shape repeats: the angles of tools stay below. For see-saws a bound
+    # on `max_angle`: [code] 60 with a weight, 90 without.
     turn: int = 360
     # The tools of the class: the values of each parameter. The first parameter varies slowest from
     # id to id. Level objects have none.
@@ -158,7 +158,7 @@ RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# A corner points to the angle. At 45 a square lies flat: [code] has these, too, in no split.
+# A corner points to the angle. [code] also has 45, a square that lies flat, but in no split.
 NO_BOX = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. What A.3 calls friction is their damping; Coulomb friction is 0 [code].
@@ -175,7 +175,7 @@ BOUNCY_BALLS = {"elasticity": (0.8, 0.9, 1.0, 1.1, 1.2), "size": (3, 5, 7, 9), "
 BELTS = {"size": range(6, 25, 2), "speed": (1, 2, 3, 4, 5, 6, -1, -2, -3, -4, -5, -6)}
 
 # Colours whose greys (0.299 R + 0.587 G + 0.114 B) are those that [code] shows to the policy. Its
-# pictures are mirrored left to right, and some are image files; [here] flat shapes, as x grows.
+# pictures are mirrored left to right, and some are image files; [here] flat shapes, not mirrored.
 ORANGE = "#fa8535"
 BLUE = "#086788"
 WOOD = "#fa9149"
@@ -299,7 +299,7 @@ def engineered_representations() -> np.ndarray:
     (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are 15 degrees
     apart (over the 2,111 alone the speed would be constant).
     """
-    # [code] orders the classes anew in every run, and has flat squares (NO_BOX); [here] sorted.
+    # [code] orders the classes anew in every run, flat squares among them; [here] sorted, without.
     one_hot = TOOL_KINDS[:, None] == np.unique(TOOL_KINDS)  # (NUM_ACTIONS, 21)
     numbers = np.array([tool[1:10] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])  # the angles
@@ -312,7 +312,7 @@ def engineered_representations() -> np.ndarray:
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
-# main results come from this draw (cannons: 12 of 24 angles). Others may be harder: 1.9 % of them
+# paper's results are of this draw (cannons: 12 of 24 angles). Others may be harder: 1.9 % of them
 # train on all five cannon angles from 120 to 180 degrees; then no test cannon shoots up and well to
 # the left, where most goals are.
 TRAINING_ANGLES = {
@@ -345,7 +345,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     | default  | 1,097 | 507   | 506   | half of the angles of each class, the published draw   |
     | random   | 1,097 | 507   | 506   | half of the angles of each class, drawn by `seed`      |
     | full     | 938   | 400   | 399   | by tool class, Table 1                                 |
-    | analysis | 761   | 3,397 | 3,397 | multiples of 30 degrees; the rest: multiples of 3      |
+    | analysis | 761   | 3,397 | 3,397 | 30 degrees apart; the rest: 3 degrees apart            |
 
     `seed` also draws which held-out tools are for validation, which for the test. The parts are
     disjoint. The no-op (id 0) is in none of them, because it is always available. The paper counts
@@ -449,8 +449,8 @@ class Task:
     target: Item
     goal: Item
     marker: Item | None = None
-    # Half ranges (norm) of uniform shifts of x and y (one number: of both), drawn once per name at
-    # every reset: for target, goal and marker, and for the items with this name as their `shift`.
+    # By name: the half range (norm) of a uniform shift of x and y (one number: of both), drawn at
+    # every reset for target, goal, marker, and all items that have the name as their `shift`.
     shifts: dict[str, float | tuple[float, float]] = field(default_factory=dict)
     subgoals: tuple = ()  # places (norm), for the marker if there is one, else the target
     marker_must_touch: bool = False  # [code] no target hit before marker and target have touched
@@ -469,7 +469,7 @@ def line(x, y, length, angle=0, shift="", kind="Thin line") -> Item:
     return item(kind, x, y, shift, elasticity=0.5, angle=angle, size=length)
 
 
-# The same with some parameters given: star(x, y), ladder(x, y, size=20), ball(kind, x, y).
+# `item` with some parameters given: star(x, y), ladder(x, y, size=20), ball(kind, x, y).
 ball = partial(item, elasticity=1.0, size=BALL_RADIUS, mass=BALL_MASS)
 star = partial(item, "Goal star", angle=90, size=4)  # the goal of most tasks
 box = partial(item, "Box", elasticity=0.1, size=5, mass=30)
@@ -517,7 +517,7 @@ TASKS = {
         subgoals=((0.7, -0.1),), marker_must_touch=True,
         target_hit_reward=2.0,  # appendix: 1; [code] 2; [here] as [code]
         max_actions=50),  # appendix: 30; [code] 50; [here] as [code], the published task
-    # The see-saw's low right end bars the gap left of the wall: lead the heavy ball to the other.
+    # The see-saw's low right end bars the gap left of the wall: lead the heavy ball to its left.
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9), goal=star(-0.8, -0.8),
         items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
@@ -692,20 +692,21 @@ class SceneObject:
     def _fixtures(self, static_body: pymunk.Body) -> list:
         """What holds a plank at its pivot and limits its turn; the weight on its end, if any."""
         # [code] has a pin joint of length zero and a slide joint, and a load shakes the centre.
-        # [here] pivot and limit joints hold it; over 800 launches per class balls move alike.
-        fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
+        # [here] pivot and limit joints; over 800 launches per class balls move as in [code].
         limit = radians(self.tool.max_angle)
         tilt = start_tilt(self.tool)
         if self.tool.kind == "Level see-saw":
-            # As in [code], for it has to shake: a still one would end episodes early (`_ended`).
+            # As in [code]: its shaking counts as motion, else episodes end early (see `_ended`).
             # The point 1 unit left of the pivot stays within 2 sin(limit / 2) of its level place.
             fixtures = [pymunk.PinJoint(self.body, static_body, (0, 0), self.place)]
             slide = (Vec2d.from_polar(-1, tilt), self.place - (1, 0), 0, 2 * sin(limit / 2))
             fixtures.append(pymunk.SlideJoint(self.body, static_body, *slide))
-        elif limit:
-            # The body's angle starts at 0, with the plank at `tilt`; limits count from there.
-            bound = pymunk.RotaryLimitJoint(static_body, self.body, -limit - tilt, limit - tilt)
-            fixtures.append(bound)
+        else:
+            fixtures = [pymunk.PivotJoint(self.body, static_body, self.place)]
+            if limit:
+                # The body's angle starts at 0, with the plank at `tilt`; limits count from there.
+                low, high = -limit - tilt, limit - tilt
+                fixtures.append(pymunk.RotaryLimitJoint(static_body, self.body, low, high))
         if self.tool.mass:
             # [code] Without a shape, nothing hits it. The GearJoint makes it turn with the plank.
             weight = pymunk.Body(self.tool.mass, self.tool.mass)  # mass, moment of inertia [code]
@@ -910,7 +911,7 @@ def draw(canvas: Canvas, tool: Tool, place: Vec2d, angle: float = 0.0) -> None:
             ahead = 1 if tool.speed > 0 else -1  # an arrow head shows where it runs to
             end = ahead * half
             canvas.polygon([at(end + 2 * ahead), at(end, 1.9), at(end, -1.9)], colour)
-        case "See-saw" | "Hinged See-saw" | "Level see-saw" | "Lever":
+        case _ if kind.contact == PLANK:
             canvas.polygon([place, place + (-2, -2), place + (2, -2)], colour)
             canvas.line(corners, 1.0, colour)
             if tool.mass:
@@ -960,7 +961,7 @@ class CreateEnv(gym.Env):
 
     ## Arguments
     `action_pool` ids (default: training split), `num_available` K, `task` of TASKS. Without
-    `subgoal_reward` subgoals and target hit pay 0 (C.3). Bad values: ValueError, nothing changes.
+    `subgoal_reward` subgoals and target hit pay 0 (C.3). Bad values: ValueError.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # four times as fast as the world
@@ -991,7 +992,7 @@ class CreateEnv(gym.Env):
         super().reset(seed=seed)
 
         # Subsampling: every episode has its own few tools of the pool, unless all are available.
-        # ([code] draws a class first in the Full Split's tests; [here] all scores draw alike.)
+        # ([code] draws a class first in the Full Split's tests; [here] every split draws alike.)
         tools = self.action_pool
         if self.num_available - 1 < len(tools):
             tools = self.np_random.choice(tools, self.num_available - 1, replace=False)
@@ -1118,8 +1119,8 @@ class CreateEnv(gym.Env):
 
     def _judge(self) -> tuple[int, bool]:
         """What this action achieved; returns (subgoals reached, target hit just now)."""
-        # First the target hit ([code]: last, so the goal comes an action later): far from its start
-        # and, if the task asks, touched by the marker. [code] Off the screen counts as at its edge.
+        # First the target hit ([code]: after the goal, which so counts an action late): far from its
+        # start and, if the task asks, touched by the marker. [code] Off the screen: as at its edge.
         hit_now = False
         if not self._target_hit:
             place = np.clip(self._target.body.position, 0.0, WORLD)
@@ -1128,7 +1129,7 @@ class CreateEnv(gym.Env):
             self._target_hit = hit_now
 
         # Then the goal. In obstacle and cannon a fan can bring the target there before the marker
-        # touches it. [code] remembers that until the hit; [here] it is forgotten after the action.
+        # touches it. [code] remembers that until the hit; [here] not: a goal counts when reached.
         self._goal_reached = self._target_hit and self._goal.touched
         self._goal.touched = False
 
@@ -1162,15 +1163,15 @@ class CreateEnv(gym.Env):
         # a lost ball, too (the marker: only until the target hit).
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
-        # A.3 "no moving objects" [code], by the speed of centres. A tool's plank only turns: still.
-        # A ball not needed that falls for ever (marker after the hit, heavy ball): moving. One in a
-        # bucket is left out: gravity alone gives it 0.07 units/s in a step.
+        # A.3 "no moving objects" [code], by the speed of centres: planks of tools, which only turn,
+        # are still; balls that are not needed move as long as they fall. One in a bucket is left
+        # out: gravity alone gives it 0.07 units/s in a step.
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
             self._still += 1
         # appendix: the episode ends at the goal; [code] goes on; [here] as the appendix.
         terminated = self._goal_reached or lost or self._still >= STILL_ACTIONS
-        # appendix: 30 actions; [code] one more than its limit; [here] the exact limit.
+        # appendix: 30 actions; [code] one more than its limit; [here] the exact limit, `truncated`.
         return terminated, not terminated and self._actions >= self.task.max_actions
 
     def _draw_objects(self, canvas: Canvas, moving: bool) -> Canvas:
@@ -1246,9 +1247,9 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# hvae.py scales a first state to (x - centre) / half_width, so here leaves it as it is (norm), and
-# divides differences between states by `step`. [here] 4 units, 4 / 42 norm: the decoder's smallest
-# standard deviation, exp(-2) = 0.135 steps, is then half a unit, half a pixel of the observation.
+# For hvae.py: first states become (x - centre) / half_width, here unchanged; differences between
+# states are divided by `step`. [here] 4 units, 4 / 42 norm: the decoder's smallest standard
+# deviation, exp(-2) = 0.135 steps, is then half a unit, half a pixel of the observation.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 
@@ -1260,7 +1261,7 @@ def action_observations(action_ids, num_observations, modality="state", seed=0, 
     | "state"  | float32 (len(ids), n, 7, 6): tool x, y, ball x, y (norm), ball velocity (norm/s) |
     | "xy"     | float32 (len(ids), n, 7, 2): ball x, y (norm)                                    |
     | "video"  | uint8 (len(ids), n, 7, 48, 48): grey pictures of the same scenes                 |
-    appendix: (x, y); [code] learned its representations from "state"; [here] as [code].
+    appendix: (x, y); [code] learned the published tables from "state"; [here] as [code].
     n = `num_observations` (paper: 1,024). Frames are 1/3 s apart, the contact in the middle where
     it can be. The bytes for one tool depend on (seed, tool, n) only, not on `workers` or other ids.
     "video" needs 16 MB per tool at n = 1,024. Raises ValueError for bad ids, modality or n.
@@ -1307,7 +1308,7 @@ def _record(n: int, modality: str, seed: int, action: int) -> np.ndarray:
         done = (touched_at > 0) & (hit | (attempt >= PROBE_ATTEMPTS - 1))
 
         # Keep 7 of 9 states, starting 3 before the touch, clipped to a start of 0..2; after a miss
-        # start at 1. So the touch is in the middle, except for very early and very late ones.
+        # start at 1. So touches at steps 31 to 60 are in the middle.
         touch = (touched_at[done] - 1) // PROBE_EVERY  # the first state recorded at it or later
         first = np.where(hit[done], np.clip(touch - 3, 0, 2), 1)
         columns = first[:, None] + np.arange(PROBE_LENGTH)  # (done, 7)
@@ -1334,18 +1335,16 @@ def _launch(tool: Tool, places, start, velocity) -> tuple[np.ndarray, np.ndarray
         arbiter.shapes[0].owner.touched = True
 
     space.on_collision(MOVING, begin=on_touch)
-    # Overlaps are looked for before the balls join the space, or each ball would find itself.
     tools = []
     for place in (to_units(places) + offsets).tolist():
         tools.append(SceneObject(tool, Vec2d(*place), space.static_body))
         space.add(*tools[-1].parts)
     probes = []
-    for place in (to_units(start) + offsets).tolist():
+    for place, speed in zip((to_units(start) + offsets).tolist(), velocity.tolist(), strict=True):
         probes.append(SceneObject(PROBE_BALL, Vec2d(*place), space.static_body))
-    overlap = [bool(space.shape_query(probe.shape)) for probe in probes]
-    for probe, speed in zip(probes, velocity.tolist(), strict=True):
-        probe.body.velocity = tuple(speed)
-        space.add(*probe.parts)
+        probes[-1].body.velocity = tuple(speed)
+        space.add(*probes[-1].parts)
+    overlap = [bool(space.shape_query(probe.shape)) for probe in probes]  # does not find itself
 
     states = np.zeros((m, PROBE_STEPS // PROBE_EVERY, 7), np.float32)
     states[..., :2] = places[:, None]
