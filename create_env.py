@@ -1119,7 +1119,7 @@ class CreateEnv(gym.Env):
 
     def _judge(self) -> tuple[int, bool]:
         """What this action achieved; returns (subgoals reached, target hit just now)."""
-        # First the target hit ([code]: after the goal, which so counts an action late): far from its
+        # First the target hit ([code]: after the goal, which so counts late): far from its
         # start and, if the task asks, touched by the marker. [code] Off the screen: as at its edge.
         hit_now = False
         if not self._target_hit:
