@@ -134,7 +134,7 @@ class Kind(NamedTuple):
     colour: str  # as people see it; the policy sees the grey that Pillow makes of it
     contact: int = PLAIN
     sides: int = 0  # of polygons
-    radius: float = 1.0  # units, of segments: [code]'s thickness // 2, so 0 or 1
+    radius: float = 1.0  # units, of segments: half their width ([code]: 0 or 1)
     # Degrees after which the shape repeats: the angles of tools stay below. For see-saws a bound
     # on `max_angle`: [code] 60 with a weight, 90 without.
     turn: int = 360
@@ -158,8 +158,8 @@ RAMPS = {"elasticity": SOFT, "angle": ANGLES, "size": LENGTHS, "damping": (1.0,)
 TRAMPOLINES = {"elasticity": BOUNCY, "angle": ANGLES, "size": LENGTHS}
 SOLIDS = {"angle": ANGLES, "elasticity": SOFT, "size": range(3, 10)}
 BOUNCERS = {"angle": ANGLES, "elasticity": BOUNCY, "size": range(3, 10)}
-# A corner points to the angle. [code] also has 45, a square that lies flat, but in no split.
-NO_BOX = {"angle": (0, 15, 30, 60, 75)}
+# A corner points to the angle. 45 is left out, a flat square: [code] has it, but in no split.
+NOT_FLAT = {"angle": (0, 15, 30, 60, 75)}
 # Planks turn on a pivot: levers freely, hinged see-saws up to a limit, see-saws too, but with a
 # weight on one end. What A.3 calls friction is their damping; Coulomb friction is 0 [code].
 HINGED = {"size": PLANK_LENGTHS, "max_angle": LIMITS, "damping": (1.0, 1.05, 1.1), "friction": (0,)}
@@ -192,8 +192,8 @@ KINDS = {
     "Trampoline": Kind("segment", "#47659f", turn=180, vary=TRAMPOLINES),
     "Triangle": Kind("polygon", ORANGE, sides=3, turn=120, vary=SOLIDS),
     "Bouncy Triangle": Kind("polygon", BLUE, sides=3, turn=120, vary=BOUNCERS),
-    "Square": Kind("polygon", ORANGE, sides=4, turn=90, vary=SOLIDS | NO_BOX),
-    "Bouncy Square": Kind("polygon", BLUE, sides=4, turn=90, vary=BOUNCERS | NO_BOX),
+    "Square": Kind("polygon", ORANGE, sides=4, turn=90, vary=SOLIDS | NOT_FLAT),
+    "Bouncy Square": Kind("polygon", BLUE, sides=4, turn=90, vary=BOUNCERS | NOT_FLAT),
     "Pentagon": Kind("polygon", ORANGE, sides=5, turn=72, vary=SOLIDS),
     "Bouncy Pentagon": Kind("polygon", BLUE, sides=5, turn=72, vary=BOUNCERS),
     "Hexagon": Kind("polygon", ORANGE, sides=6, turn=60, vary=SOLIDS),
@@ -299,7 +299,7 @@ def engineered_representations() -> np.ndarray:
     (rad), weight, left_up, force, speed, standardised over the 2,326 tools that are 15 degrees
     apart (over the 2,111 alone the speed would be constant).
     """
-    # [code] orders the classes anew in every run, flat squares among them; [here] sorted, without.
+    # [code] orders its classes (flat squares are one) anew in every run; [here] sorted, without it.
     one_hot = TOOL_KINDS[:, None] == np.unique(TOOL_KINDS)  # (NUM_ACTIONS, 21)
     numbers = np.array([tool[1:10] for tool in TOOLS], np.float64)  # (NUM_ACTIONS, 9)
     numbers[:, [1, 4]] = np.radians(numbers[:, [1, 4]])  # the angles
@@ -312,9 +312,9 @@ def engineered_representations() -> np.ndarray:
 
 # The Default Split is one draw that [code] ships: the training angles of each group of classes (of
 # see-saws the limits). Two classes of one shape share them: a held-out angle is new for both. The
-# paper's results are of this draw (cannons: 12 of 24 angles). Others may be harder: 1.9 % of them
-# train on all five cannon angles from 120 to 180 degrees; then no test cannon shoots up and well to
-# the left, where most goals are.
+# paper's results are of this draw (cannons: 12 of 24 angles). In 1.9 % of draws training has all
+# five cannon angles from 120 to 180 degrees: harder, as no test cannon shoots up and well to the
+# left, where most goals are.
 TRAINING_ANGLES = {
     ("Ramp", "Trampoline"): (45, 60, 75, 90, 105, 165),
     ("Triangle", "Bouncy Triangle"): (30, 45, 60, 105),
@@ -352,7 +352,7 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     it: once in the 2,111 of the default split and in the 762 training tools of the analyses, twice
     in the 1,739 of the Full Split (in training and held out). Default and random have no balls,
     bouncy balls, levers or belts, full has no 4- to 6-sided polygons, analysis has neither.
-    A class of your own is in every split; half of its first parameter's values train (of three 2).
+    A class of your own is in every split; half of its first parameter's values train (2 of 3).
     """
     if split not in SPLITS:
         raise ValueError(f"unknown split {split!r}; allowed: {', '.join(SPLITS)}")
@@ -504,8 +504,8 @@ TASKS = {
         marker=ball("Marker", 0.6, 0.75), target=ball("Target", 0.1, -0.14), goal=star(-0.7, -0.64),
         items=(line(0.1, -0.25, 16, shift="target"), line(-0.7, -0.75, 16, shift="goal")),
         shifts={"marker": 0.2, "target": 0.2, "goal": 0.2}),
-    # Two pairs of boxes fall: catch them. Else the right pair blocks the marker's way (by the
-    # subgoal, down, back to the target), the left pair the target's (down a slope to the star).
+    # Two pairs of boxes fall: catch them. Else the right one stops the marker (its way: right to
+    # the subgoal, down, back left), the left one the target (left, down a slope to the star).
     "obstacle": Task(
         marker=ball("Marker", -0.8, 0.8), target=ball("Target", 0.1, -0.47), goal=star(-0.9, -0.69),
         items=(line(-0.61, 0.39, 35.6, -30), line(-0.25, 0.04, 12.7, 90), line(0.07, -0.1, 26),
@@ -517,7 +517,8 @@ TASKS = {
         subgoals=((0.7, -0.1),), marker_must_touch=True,
         target_hit_reward=2.0,  # appendix: 1; [code] 2; [here] as [code]
         max_actions=50),  # appendix: 30; [code] 50; [here] as [code], the published task
-    # The see-saw's low right end bars the gap left of the wall: lead the heavy ball to its left.
+    # The see-saw's low right end bars the gap left of the wall: the heavy ball, led to the
+    # see-saw's left, lifts it.
     "seesaw": Task(
         target=ball("Target", 0.2, 0.9), goal=star(-0.8, -0.8),
         items=(ball("Heavy ball", -0.3, 0.5, "ball", mass=30, elasticity=0.1),
@@ -602,8 +603,8 @@ MUZZLE = (5.0, 3.65)  # [code] units, half the unturned box: a shot starts (5 co
 # [code] Funnels and buckets are open between their last corner and their first. At tool angle 0 a
 # funnel's are at 150 (left rim), 270 (nozzle) and 30 degrees, a bucket's at 135, 225, 315 and 45.
 LAST_CORNER = {"Funnel": 30, "Bucket": 45}
-# [code] The probe ball touches the no-op when its centre is within 0.1 sqrt(8) norm, 11.9 units: a
-# disc smaller by the ball's radius does so. A sensor (GOAL), it is only felt.
+# The no-op is recorded, too. [code] The probe ball touches it if its centre is within 0.1 sqrt(8)
+# norm, 11.9 units: a disc smaller by the ball's radius. A sensor (GOAL), it is only felt.
 NO_OP_RADIUS = 0.1 * sqrt(8) * WORLD / 2 - BALL_RADIUS
 
 
@@ -691,12 +692,12 @@ class SceneObject:
 
     def _fixtures(self, static_body: pymunk.Body) -> list:
         """What holds a plank at its pivot and limits its turn; the weight on its end, if any."""
-        # [code] has a pin joint of length zero and a slide joint, and a load shakes the centre.
-        # [here] pivot and limit joints; over 800 launches per class balls move as in [code].
+        # [code] has a pin and a slide joint: under a load the plank's centre shakes. [here] pivot
+        # and limit joints; over 800 launches per class balls move as in [code].
         limit = radians(self.tool.max_angle)
         tilt = start_tilt(self.tool)
         if self.tool.kind == "Level see-saw":
-            # As in [code]: its shaking counts as motion, else episodes end early (see `_ended`).
+            # As in [code]: its centre shakes, which counts as motion; else episodes end early.
             # The point 1 unit left of the pivot stays within 2 sin(limit / 2) of its level place.
             fixtures = [pymunk.PinJoint(self.body, static_body, (0, 0), self.place)]
             slide = (Vec2d.from_polar(-1, tilt), self.place - (1, 0), 0, 2 * sin(limit / 2))
@@ -762,7 +763,7 @@ def _on_fan(arbiter, space, data) -> None:
     mover, fan = (shape.owner for shape in arbiter.shapes)
     push = Vec2d.from_polar(fan.tool.force, radians(fan.tool.angle))
     # [code] turns the force with the ball as it rolls. [here] not, because wind does not turn with
-    # a ball; so it is in the authors' separate release of CREATE.
+    # a ball; nor does it in the authors' second release, which is of CREATE alone.
     mover.body.apply_force_at_world_point(push, mover.body.position)
 
 
@@ -787,7 +788,7 @@ def _on_bucket(arbiter, space, data) -> None:
             mover.held_by = holder
     if mover.held_by is holder:
         # [code] resets the position alone, and the ball's speed grows without end. [here] it is
-        # stopped as well, as in the authors' separate release of CREATE.
+        # stopped as well, as in the authors' second release (see `_on_fan`).
         _put_at_rest(mover.body, holder.place)
     arbiter.process_collision = mover.held_by is None
 
@@ -809,8 +810,8 @@ def make_space() -> pymunk.Space:
     space.sleep_time_threshold = SLEEP_TIME
     # A target that stays on a goal is noted anew: `_judge` forgets the touch after each action.
     space.on_collision(GOAL, MOVING, pre_solve=_on_goal)
-    # Two balls: as their touch begins [code]. But never give a task both a marker and a goal ball:
-    # a touch of the goal ball before the target hit would be forgotten (see `_judge`).
+    # Two balls: as their touch begins [code]. So never give a task a marker and a goal ball: a
+    # touch before the target hit is forgotten by `_judge`, and while it lasts none begins again.
     space.on_collision(MOVING, MOVING, begin=_on_goal)
     space.on_collision(MOVING, BELT, pre_solve=_on_carrier)
     space.on_collision(MOVING, LADDER, pre_solve=_on_carrier)
@@ -941,7 +942,7 @@ class CreateEnv(gym.Env):
     `Dict(choice=Discrete(K), position=Box(-1, 1, (2,), float32))`: an index of `available`, and
     where to put the tool's centre (norm). Choice 0 is always the no-op. `step` also accepts
     positions outside of the Box, as an unclipped Gaussian policy makes them: the tool is refused.
-    `placement` tells what came of it: "placed", "waited", "outside", "too close" or "blocked".
+    The attribute `placement` is then "placed", "waited", "outside", "too close" or "blocked".
 
     ## Observation Space
     `state`, Box(0, 255, (3, 84, 84), uint8): grey pictures, one at the end of each of the last 3
@@ -1119,8 +1120,8 @@ class CreateEnv(gym.Env):
 
     def _judge(self) -> tuple[int, bool]:
         """What this action achieved; returns (subgoals reached, target hit just now)."""
-        # First the target hit ([code]: after the goal, which so counts late): far from its
-        # start and, if the task asks, touched by the marker. [code] Off the screen: as at its edge.
+        # First the target hit: far from its start (off the screen: as at its edge [code]) and, if
+        # the task asks, touched by the marker. [code] does this last, so a goal counts late.
         hit_now = False
         if not self._target_hit:
             place = np.clip(self._target.body.position, 0.0, WORLD)
@@ -1133,8 +1134,8 @@ class CreateEnv(gym.Env):
         self._goal_reached = self._target_hit and self._goal.touched
         self._goal.touched = False
 
-        # Then the subgoals; a reached one is gone from this picture on ([code]: the next). [code]
-        # counts what is touched at the end of an action; [here] at any time in it, as for the goal.
+        # Then the subgoals; one reached now is not in this picture ([code]: from the next on). And
+        # [code] counts what is touched as an action ends; [here] at any time in it, as the goal.
         reached = [subgoal for subgoal in self._subgoals if subgoal.touched]
         for subgoal in reached:
             self._space.remove(*subgoal.parts)
@@ -1163,8 +1164,8 @@ class CreateEnv(gym.Env):
         # a lost ball, too (the marker: only until the target hit).
         needed = [self._target] if self._target_hit else [self._target, self._marker]
         lost = not all(0.0 < value < WORLD for one in needed for value in one.body.position)
-        # A.3 "no moving objects" [code], by the speed of centres: planks of tools, which only turn,
-        # are still; balls that are not needed move as long as they fall. One in a bucket is left
+        # A.3 "no moving objects" [code], by the speed of centres: a tool's plank only turns, so it
+        # is still; a lost ball that is not needed falls on, so it moves. One in a bucket is left
         # out: gravity alone gives it 0.07 units/s in a step.
         moving = [one.body for one in self._objects if one.body and not one.held_by]
         if all(body.velocity.length < STILL_SPEED for body in moving):
@@ -1247,9 +1248,9 @@ PROBE_AREA = 0.7  # [code] norm: the tool stands in [-0.7, 0.7]^2
 PROBE_VIDEO = 48  # appendix: 48x48 in A.3 and D.3.1, 84x84 in B; [code] 48x48; [here] as A.3
 PROBE_BALL = ball("Marker", 0, 0).tool
 CELL = 1_000.0  # [here] units: the launches of a tool share one space, too far apart to meet
-# For hvae.py: first states become (x - centre) / half_width, here unchanged; differences between
-# states are divided by `step`. [here] 4 units, 4 / 42 norm: the decoder's smallest standard
-# deviation, exp(-2) = 0.135 steps, is then half a unit, half a pixel of the observation.
+# For hvae.py: it divides differences between states by `step`; first states stay as they are.
+# [here] 4 units, 4 / 42 norm: hvae.py keeps the decoder's standard deviation above exp(-2) = 0.135
+# steps, which is then half a unit, half a pixel of the observation.
 UNITS = dict(centre=0.0, half_width=1.0, step=4 / 42)
 
 

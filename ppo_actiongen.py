@@ -37,9 +37,9 @@ then what surrounds them: which actions are available, checks, the run's folder,
 
 An environment is a module (the smallest: exercises/dial.py). It shows a dictionary: the "state",
 and "available", the ids of the K actions to choose from. A step is one action of one environment. A
-*score* is one number per episode (success, click-through rate, height), in its last step's info
-under the key METRIC of the module. "The encoder" is hvae.py's; f_omega(s), the *encoding* of s, is
-that of `agent.encoder`.
+*score* is one number per episode (success, click-through rate, height), in the info of its last
+step under the key `module.METRIC`. "The encoder" is hvae.py's; `agent.encoder`, the *state
+encoder*, is f_omega, and its output the *encoding* of s.
 
 Letters in shapes: T actions of each of N environments in a rollout, B rows of a batch, K available,
 n training, A all actions, D numbers in a representation, H hidden units.
@@ -120,7 +120,7 @@ class Args:
     # --- which actions are available ---
     num_available: int = 50  # K while training (Table 3 "actions per episode")
     eval_available: int | None = None  # K in evaluations; None: num_available
-    subsample: bool = True  # a random subset per episode; off: all training actions, always
+    subsample: bool = True  # a random subset per episode; off: a fixed set, always
     fixed_set_size: int | None = None  # size of the set with --no-subsample, --adapt; None: all
 
     # --- PPO (Table 4 unless it says otherwise) ---
@@ -147,7 +147,7 @@ class Args:
     aux_conditioned: bool = False  # the position depends on the chosen action (C.4)
     bilinear: bool = False  # utility c . (M f_omega(s) + m) in place of an MLP [here]
     one_hot: bool = False  # Grid World: the policy sees cells as one-hot vectors [here]
-    small_pictures: bool = False  # half size, inverted; another CNN: see cnn [here]
+    small_pictures: bool = False  # CREATE: half size, inverted; another CNN: see cnn [here]
 
     # --- evaluation ---
     eval_every: int = 409_600  # steps between two evaluations
@@ -157,7 +157,7 @@ class Args:
     # --- run ---
     runs_dir: str = "runs"  # folder of runs and representations
     run_name: str | None = None  # name of the run's folder; None: see run_name_of
-    resume: bool = False  # go on from the last checkpoint; the same bits if started the same way
+    resume: bool = False  # go on from the last checkpoint; same device, same processes: same bits
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: a GPU if there is one
 
     @property
@@ -211,14 +211,14 @@ FAST = {
     "recsys": dict(
         bilinear=True,  # an MLP learns single products by heart
         hidden_size=256,  # 64 units fit the user's taste less well
-        gamma=0.0,  # a click changes little of what comes after it: see recsys.py
+        gamma=0.0,  # a click changes little of what comes after it
         minibatch_size=512,  # more updates per step: T = 64
         num_available=100,  # a fifth of the cost of the utilities
         eval_available=500,  # tests keep the number of Table 3
         total_timesteps=10_000_000,
     ),
     "create": dict(
-        small_pictures=True,  # a quarter of the cost; empty places are 0 there, not 255
+        small_pictures=True,  # cheaper; empty places are 0, so that tools are what stands out
         aux_conditioned=True,  # a ramp and a cannon belong in different places
         published_init=False,  # as in Grid World
         lr_decay_steps=None,  # as D.2 says: the rate falls over the run, whatever its length
@@ -226,7 +226,7 @@ FAST = {
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
-        head_epochs=3,  # the layers after f_omega need more: three passes of their own
+        head_epochs=3,  # the layers after f_omega learn faster by three passes of their own
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds begin to learn late
         clip_coef=0.2,  # goals are rare, so each of them may teach more
@@ -236,7 +236,7 @@ FAST = {
         eval_every=102_400,  # 40 evaluations
     ),
     "stacking": dict(
-        published_init=False,  # as in Grid World; and at first towers are rarely ended
+        published_init=False,  # as in Grid World; and towers start at "go on": see fc_stop
         lr_decay_steps=None,  # as in CREATE
         minibatch_size=32,  # physics is the cost: rollouts of T = 4, many updates for few steps
         clip_vloss=False,  # as in CREATE: heights, too, are large against clip_coef
@@ -277,7 +277,7 @@ def default_args(env="gridworld", recipe="fast", quick=False):
 
 # Started by `torchrun --nproc_per_node=2 ppo_actiongen.py ...`, each process (its number is RANK)
 # plays its share of the environments and learns from its share of every minibatch. Gradients are
-# averaged, so all processes keep the same weights. Rank 0 alone evaluates and writes.
+# averaged, so all processes keep the same weights. Rank 0 alone evaluates and writes the run.
 RANK = int(os.environ.get("RANK", 0))
 WORLD_SIZE = int(os.environ.get("WORLD_SIZE", 1))
 
@@ -354,13 +354,13 @@ def cnn(frames, H, small):
             layer_init(conv)
         layers += [conv, nn.ReLU()]
     layers.append(nn.Flatten())  # (B, channels, side, side) -> (B, features)
-    if small:  # the more tools in the picture, the larger all features: LayerNorm undoes this
+    if small:  # more tools make all features larger, whatever they show: LayerNorm undoes this
         layers.append(nn.LayerNorm(features, elementwise_affine=False))
     return nn.Sequential(*layers, layer_init(nn.Linear(features, H)), nn.ReLU())
 
 
 def small_inverted(frames):
-    """Pictures (B, frames, 84, 84), dark on white -> (B, frames, 42, 42) uint8, bright on 0."""
+    """CREATE's pictures (B, frames, 84, 84) -> (B, frames, 42, 42) uint8, tools bright on 0."""
     # The white background becomes 0. At the start of an episode, the stack of frames is padded with
     # black ones; inverted they would be all 255, so they are set to 0.
     is_real = frames.amax((2, 3), keepdim=True) > 0  # (B, frames, 1, 1)
@@ -460,8 +460,8 @@ class Agent(nn.Module):
             self.fc_beta = self.position_head()
         if "stop" in self.action_parts:
             self.fc_stop = layer_init(nn.Linear(H, 2), 0.01)
-            # Outputs: 0 go on, 1 stop. Untrained, they are equally likely, and a tower ends after
-            # two shapes. The fast recipe starts with going on [here].
+            # Outputs: 0 go on, 1 stop. Untrained, they are equally likely, and a tower has one
+            # shape on average. The fast recipe starts with going on [here].
             if not args.published_init:
                 nn.init.constant_(self.fc_stop.bias[0], 4.0)
 
@@ -531,14 +531,14 @@ class Agent(nn.Module):
         action_part = F.linear(self.table[ids], weight, bias)  # (U, H)
 
         # The rest of the MLP: ReLU and one linear output. The hidden layers of all pairs do not fit
-        # into the processor's cache, so b = `piece` states at a time: 800,000 numbers, 3 MB [here].
+        # into the processor's cache, so S = `piece` states at a time: 800,000 numbers, 3 MB [here].
         # (index_select(0, rows) is a faster action_part[rows].)
         piece = max(1, 800_000 // (available.shape[1] * encoding.shape[1]))
         logits = []
         for e_part, rows in zip(state_part.split(piece), row_of.split(piece), strict=True):
-            c_part = action_part.index_select(0, rows.flatten())  # (b * K, H)
-            hidden = e_part[:, None] + c_part.unflatten(0, rows.shape)  # (b, 1, H) + (b, K, H)
-            logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (b, K)
+            c_part = action_part.index_select(0, rows.flatten())  # (S * K, H)
+            hidden = e_part[:, None] + c_part.unflatten(0, rows.shape)  # (S, 1, H) + (S, K, H)
+            logits.append(F.relu(hidden) @ self.utility_out.weight[0])  # (S, K)
         return torch.cat(logits) + self.utility_out.bias
 
     def choice_policy(self, encoding, available):
@@ -573,7 +573,7 @@ class Agent(nn.Module):
         # The policy is a product of up to three distributions: which action, where, and whether to
         # stop. So their log-probabilities add up. Their entropies are added up for the bonus, that
         # of the position with a weight of its own (Table 3). In C.4 every action has its own
-        # distribution of positions; only the chosen action's has its entropy added [code].
+        # distribution of positions; the bonus counts that of the chosen action alone [code].
         is_new = action is None
         if is_new:
             action = {}
@@ -606,7 +606,7 @@ class Agent(nn.Module):
             if is_new:
                 action["position"] = 2 * place.sample() - 1  # (B, dims), from [0, 1] to [-1, 1]
             # float32 may round to the border, where the log-density is minus infinity. (It is the
-            # density on [0, 1]; that on [-1, 1] is half of it, and in a ratio the half cancels.)
+            # density on [0, 1]; on [-1, 1] it is half as large, but PPO's ratio is the same.)
             unit = (0.5 + action["position"] / 2).clamp(1e-6, 1 - 1e-6)
             logprob = logprob + place.log_prob(unit).sum(1)
             entropy = entropy + AUX_ENT_SCALE * place.entropy().sum(1)
@@ -692,7 +692,7 @@ def gae(rewards, values, dones, next_value, gamma, lam=GAE_LAMBDA):
 
 
 def running_returns(rewards, dones, G, gamma):
-    """Discounted sums of the rewards up to now. `train` divides the rewards by their spread.
+    """Discounted sums of the rewards up to now. `train` divides rewards by the sums' spread.
 
     G <- gamma G + r at every step, 0 after an episode. Returns all G (T, N), and the last (N,).
     """
@@ -722,7 +722,7 @@ def ppo_loss(agent, mb, ent_coef):
     pg_loss = -torch.min(ratio * mb["advantage"], clipped_ratio * mb["advantage"]).mean()
 
     # The critic learns the return, which is its own estimate plus the advantage. [code] also
-    # limits the value's change since the rollout, by clip_coef, which is made for ratios.
+    # limits the value's change since the rollout, by clip_coef, whatever the scale of the values.
     error = (value - mb["return"]).square()
     if args.clip_vloss:
         change = (value - mb["value"]).clamp(-args.clip_coef, args.clip_coef)
@@ -750,8 +750,8 @@ def update(agent, optimizer, batch, ent_coef):
     # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
     # the first step the policy is no longer the one that played, hence the ratio in ppo_loss.
     for epoch in range(agent.args.update_epochs + agent.args.head_epochs):
-        # The last head_epochs passes leave f_omega as it is (no gradient, so Adam skips it): in
-        # further passes it would move the policy too far, but the layers after it need them.
+        # The last head_epochs passes leave f_omega as it is (no gradient, so Adam skips it): found
+        # by trying, more passes of f_omega overshoot, but the layers after it learn faster.
         agent.encoder.requires_grad_(epoch < agent.args.update_epochs)
         parameters = [p for p in agent.parameters() if p.requires_grad]
         order = torch.randperm(len(flat["value"]), device=agent.table.device)
@@ -782,7 +782,7 @@ def train(args):
     # 1. of Algorithm 1: the table of all c_i, made by the encoder, which is trained if need be.
     table = load_table(args)
 
-    # Environments, networks, optimiser. (Under torchrun, processes take the GPUs in turn.)
+    # Environments, networks, optimiser. (Under torchrun, process r has GPU r modulo their number.)
     device = "cpu"
     if args.device != "cpu" and torch.cuda.is_available():
         device = f"cuda:{RANK % torch.cuda.device_count()}"
@@ -1027,9 +1027,9 @@ def action_phases(args):
     # Three cases learn with a fixed set instead, all of it available all the time, and "train"
     # scores them on it: nearest neighbour, the ablation without subsampling, and C.2 [code]. Where
     # the utilities would cost too much, fixed_set_size makes the set smaller [code]; nearest
-    # neighbour, whose outputs are cheap, keeps all of it. (C.2 is compared with a zero-shot
-    # score: evaluate the run that was not adapted on as many actions, by --num-available. If these
-    # are fewer than the pool, each episode draws others.)
+    # neighbour, whose outputs are cheap, keeps all of it. (C.2's zero-shot score: `evaluate` the
+    # run before --adapt, with --num-available as large as this set. If the pool is larger, each of
+    # its episodes has another set.)
     if args.method == "nearest-neighbor" or args.adapt or not args.subsample:
         if args.fixed_set_size and args.method != "nearest-neighbor":
             rng = np.random.default_rng(42)  # [code]: the same actions for all seeds
@@ -1055,7 +1055,7 @@ def check_number(phase, args):
 
 def load_table(args):
     """The representations (A, D); trains the encoder if its table is not there yet."""
-    if args.finetune:  # goes on with its table; --representation is ignored
+    if args.finetune:  # goes on with its table
         return load(Path(args.finetune) / "best.pt")["agent"]["table"].numpy()
     # Representations made by hand: an environment computes them from what it knows of its actions.
     # In Grid World: the moves and their sum [code]; with "engineered-5d" five numbers (appendix B).
@@ -1069,8 +1069,9 @@ def load_table(args):
         hvae.check_table("engineered_representations", table, args.module)
         return table
     # The encoder is trained on training actions only (but for "hvae-all"). Then it gives every
-    # action a representation, the unseen ones, too: the mean of q(c | its recordings). One table
-    # serves all seeds of the policy, as published: the encoder's seed stays 0.
+    # action a representation, the unseen ones, too: the mean of q(c | its recordings). (The VAE
+    # has no c: the mean over all its recordings.) One table serves all seeds of the policy, as
+    # published: the encoder's seed stays 0.
     path = Path(args.representation)  # FILE.npz; else the name of a kind of encoder
     if path.suffix != ".npz":
         encoder_args = hvae.default_args(args.env, args.hvae_recipe, args.modality)
@@ -1090,8 +1091,8 @@ def load_table(args):
 
 def start_from(agent, folder):
     """C.2: take over the weights of a trained policy."""
-    # With another split, the old policy would have been trained with some "new" actions. Its
-    # representations are taken over, too; the other options decide layers.
+    # With another split, the old policy would have been trained with some "new" actions. Another
+    # task or kind of representation is taken for a slip. The last three names decide layers.
     theirs = load(folder / "best.pt")
     names = "env task method split split_seed representation hidden_size bilinear aux_conditioned"
     for name in names.split():
@@ -1148,7 +1149,7 @@ def run_name_of(args):
     name = args.run_name
     if name is None:
         usual = vars(default_args(args.env, args.recipe, args.quick))
-        usual.update(recipe="fast", quick=False)  # if not so, these two appear in the name, too
+        usual.update(recipe="fast", quick=False)  # so --recipe paper and --quick are in the name
         words = [hvae.environment_name(args.env)]
         for option, value in vars(args).items():
             if value != usual[option] and option not in ("seed", *FREE):
@@ -1248,7 +1249,7 @@ class Log:
         if row["train_score"] is not None:
             line = "step {step:,}: seen {train_score:.3f}, validation {valid_score:.3f}"
             self.bar.write(line.format(**row))
-            self.writer.flush()  # a checkpoint follows, and what is before it is not made again
+            self.writer.flush()  # --resume repeats nothing from before the checkpoint that follows
         return self.path.stat().st_size
 
 

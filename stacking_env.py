@@ -2,8 +2,9 @@
 
 Two cylinders stand on a table. An action names one of 20 available shapes and the place above which
 it is let go, and the physics (pybullet) decides what stays up. The score is the height of the
-highest centre of mass (not top) when the agent stops or has acted ten times. At test time the sizes
-(or classes) of the shapes were never used in training: the agent must understand their pictures.
+highest centre of mass (not top) when the agent stops or has acted ten times; the reward is Eq. 4's.
+At test time the sizes (or classes) of the shapes were never used in training: the agent must
+understand their pictures.
 
                        __
                       |__|     <- let go 0.02 above everything, at the x the agent chose
@@ -71,13 +72,13 @@ SPLITS = ("default", "full")  # A.4
 PLACEMENTS = {"none": 0, "1d": 1, "2d": 2}
 
 # ---- rules of the game (A.4) ----
-MAX_STEPS = 10  # Table 3 "max. episode length" [code]; A.4: 10 "placements", but repeats count
+MAX_STEPS = 10  # Table 3 "max. episode length"; [code] counts repeats, A.4 only "placements"
 NUM_AVAILABLE = 20  # Table 3, "actions per episode"
 LAMBDA_TOP = 0.5  # Eq. 4
 LAMBDA_AVG = 0.5  # Eq. 4
 FRAMES = 4  # A.4: "stack past 4 frames"
 SIZE = 84  # A.4: "84x84 grayscale image"
-DROP_GAP = 0.02  # m [here]: A.4 has a "soft drop"; the shapes are .16 to 1.92 m wide
+DROP_GAP = 0.02  # m [here]: A.4's "soft drop"; small beside shapes .16 to 1.92 m wide
 # A scene starts with two copies of one of these, "at random locations on a line" (A.4), here x.
 CYLINDERS = (798, 799, 800)  # [code]: ids in SHAPES, with radii of .33, .34 and .36 m
 CENTRE = (-0.2, 0.2)  # m [code]: x of the middle between the two
@@ -110,14 +111,15 @@ REST_DEPTH = 0.01  # m; an eighth of the thinnest shape
 # does not see the top of a higher tower.
 FRONT = ((0.0, -7.0, 2.5), (0.0, 0.0, 2.5))
 RAISED = ((0.0, -4.0, 5.5), (0.0, 1.66, 0.0))  # for 2D Place, where depth matters
-# Action observations are taken from a circle, at random heights [code]; 38 shapes do not fit.
+# Action observations are taken from a circle, at random heights [code]. 38 shapes fill more
+# than the picture.
 VIEW_RADIUS = 2.0  # m
 VIEW_HEIGHT = (0.5, 2.0)  # m
 # [here] The light comes from over the photographer's right shoulder: (right, up, back), of length
 # 1. It moves with the camera, so the faces of a shape differ in brightness from every viewpoint.
 LIGHT = (0.24, 0.52, 0.82)
 TABLE = (4.0, 2.0, 0.1)  # half sizes, m; [code] draws 8 x 4, the thickness is [here]
-WOOD = (0.82, 0.66, 0.45)  # [here] the lit table is 120 of 255 in grey (2D Place: 167)
+WOOD = (0.82, 0.66, 0.45)  # [here] the lit table is 119 of 255 in grey (2D Place: 167)
 # For people, all [here]: the colour pictures of `render`, and of GIFs while a shape falls.
 COLOUR_SIZE = 336  # pixels
 COLOUR_CAMERA = ((0.0, -12.8, 5.7), (0.0, 0.0, 4.35))  # up to a height of 9.5
@@ -159,7 +161,7 @@ class Family:
     label: str = ""  # its class in Table 2, where that is not the name
     bullet_type: int = p.GEOM_MESH
     moments: tuple = ()  # of inertia about x, y, z, scale 1, mass 1; () for flat sides
-    same_as: str = ""  # the family that has the same solid, on another face or as a plain copy
+    same_as: str = ""  # the family whose body it is, laid on another face, or a plain copy
 
     def parts(self) -> np.ndarray:
         """The convex parts (P, V, 3): one, but three for the arch."""
@@ -312,8 +314,8 @@ def engineered_representations() -> np.ndarray:
     """Ground truth, to compare with: scale, sin, cos of angle, one-hot family; (810, 19)."""
     # [code] gives the angle itself (and an axis, always vertical); [here] a point on the circle, so
     # that 350 degrees is close to 0. Angles stop before the form repeats, so no form appears twice
-    # within a family. Known flaw, as in [code]: a box at 162 degrees looks much like one at 0, but
-    # their rows are far apart.
+    # within a family. Known flaw, as in [code]: a box repeats after 180 degrees, so at 162 it looks
+    # much like at 0, but their rows are far apart.
     table = np.zeros((NUM_ACTIONS, 3 + len(FAMILIES)), dtype=np.float32)
     for row, shape in zip(table, SHAPES, strict=True):
         row[:3] = (shape.scale, math.sin(shape.angle), math.cos(shape.angle))
@@ -335,18 +337,18 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
 
     # Default Split (A.4): scale "is randomly split", so a test shape differs in size from every
     # training shape of its family; all angles of a scale stay together. (A.4: of its class,
-    # but some classes have two families.) [code] draws per family; [here] one draw decides for a
-    # solid (form and size) in all families that have it: else a cone would be in training and its
-    # copy, the other cone, in the test. What earlier families decided stays; then each family draws
-    # until half of its own solids are in training. So `cone-hires` draws half of its solids, and
-    # `cone` finds all of its own decided; `rectangle` shares one with `horizontal_rectangle`.
+    # but some classes have two families.) [code] draws per family; [here] per solid (form and
+    # size): one draw holds for every family that has it, or one cone would train and its copy be
+    # tested. Family by family, what is decided stays, and solids are drawn until half of the
+    # family's are in training. `cone-hires` draws half of its solids; then all of `cone`'s are
+    # decided; `rectangle` shares one with `horizontal_rectangle`.
     decided = set()
     train_solids = set()
     for family in FAMILIES:
         own = [shape.solid_key() for shape in SHAPES if shape.family is family]
         solids = list(dict.fromkeys(own))  # each once
         undecided = [solid for solid in solids if solid not in decided]
-        # Already in training are half of them, one, or none: `missing` is never negative.
+        # In training already: half of them, one, or none, so `missing` is never negative.
         missing = len(solids) // 2 - len(train_solids.intersection(solids))
         order = rng.permutation(len(undecided))
         train_solids.update(undecided[k] for k in order[:missing])
@@ -359,9 +361,9 @@ def split_actions(split: str = "default", seed: int = 0) -> dict[str, np.ndarray
     if split == "full":
         train = np.isin(action_labels(), TABLE_2_TRAIN)
 
-    # A.4: "randomly splitting the test set into half". The two cones are copies and must not be on
-    # both sides: one solid at one angle is a group (as are some hats and triangles: no harm).
-    # Groups in random order go to validation where they still fit into its half, else to the test.
+    # A.4: "randomly splitting the test set into half". A solid at one angle is a group, so that the
+    # two cones, copies, are on one side (some hats and triangles are, too: no harm). Groups in
+    # random order go to validation where they still fit into its half, else to the test.
     unseen = np.flatnonzero(~train).tolist()
     copies = {}  # (solid, angle) -> ids
     for shape_id in unseen:
@@ -643,8 +645,8 @@ class StackingEnv(gym.Env):
         inside = (np.abs(position) <= 1).all()
 
         # Drop the shape and wait until the scene has settled. ([code] also waits when nothing was
-        # dropped; [here] not.) Coordinates that the agent does not decide are 0, the table's centre
-        # (C.6). [code] First halts what still moves; it makes no measurable difference.
+        # dropped; [here] not.) What still moves is halted first [code]: no measurable difference.
+        # Coordinates that the agent does not decide are 0, the table's centre (C.6).
         if inside and shape_id not in self.shape_ids[2:] and not stop:
             for body in self._bodies:
                 self._bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
