@@ -10,21 +10,21 @@ none). The model, and its bound from the main paper, with c ~ q(c | X) and z_j ~
     ELBO per observation = mean_j [ log p(x_j | z_j, c, s_j) - KL(q(z_j | x_j, c) || p(z_j | c)) ]
                            - KL(q(c | X) || N(0, I)) / |X|
 
-Only recipe paper divides the last term by |X|; quick and fast divide by more (`kl_c_divisor`): a
-weaker KL (a beta-VAE, beta < 1), so that more dimensions of c carry information. The representation
-of an action is the mean of q(c | X). A split has three parts: train, valid, test. The networks
-learn from the first and CREATE's no-op; with `--train-on all`, the oracle encoder, from all three.
-In the end every action of the three and the no-op get a row of a table; all others keep zeros.
+Only `--recipe paper` divides the last term by |X|; the recipes quick and fast by more: a weaker KL
+(a beta-VAE, beta < 1), so that more dimensions of c carry information. The representation of an
+action is the mean of q(c | X). A split has three parts: train, valid, test. The networks learn from
+the first and CREATE's no-op; with `--train-on all`, the oracle encoder, from all three.
+In the end every action of the three and the no-op get a row of a table; ids in no part keep zeros.
 
     python hvae.py gridworld                     # recipe fast, the default
     python hvae.py gridworld --no-hierarchical   # appendix B: the plain VAE baseline
     python hvae.py gridworld --train-on all      # the oracle encoder: trained on all parts
-    python hvae.py create --modality video       # appendix B: videos; its Full Split: --split full
+    python hvae.py create --modality video       # appendix B; or its Full Split: --split full
     python hvae.py gridworld --recipe paper      # Tables 3-4, days on a CPU; --help: its numbers
     python hvae.py my_env.py                     # an environment of your own, in a file
 
 Your file defines NUM_ACTIONS, MODALITIES (the first is the default); if needed SPLITS (names),
-NO_OP (an id), UNITS (see `prepare`); and
+NO_OP (an id), UNITS (a dict, see `prepare`); and
 
     split_actions(split, seed) -> {"train": ids, "valid": ids, "test": ids}
     action_labels() -> (NUM_ACTIONS,), engineered_representations() -> (NUM_ACTIONS, D): classes and
@@ -32,9 +32,9 @@ NO_OP (an id), UNITS (see `prepare`); and
     action_observations(ids, count, modality, seed, workers) -> array (len(ids), count, ...)
 
 An observation is (L, F), L states of F numbers each. Of modality "onehot" it is (L, 2), a cell's x
-and y as whole numbers 0-79, at most 39 from those of the first state and of the state before. Of
-"image" it is (S, S), of "video" (L, S, S), greys 0-255, S 48 or 84. Each action's random
-numbers follow from (seed, id): a call, or one of its `workers` processes, gets only some ids.
+and y as whole numbers 0-79, at most 39 from the first and previous state's (see `prepare`). Of
+"image" it is (S, S), of "video" (L, S, S), greys 0-255, S 48 or 84. Draw an action's random numbers
+from (seed, id) alone: a call, or one of its `workers` processes, gets only some of the ids.
 Marks: "appendix", that of Generalization to New Actions in RL (ICML 2020); [code], the authors'
 program; [here], our choice, and why. Where several are named, the file does the last.
 """
@@ -61,10 +61,10 @@ from tqdm import tqdm
 # Figures 4-6 -> plot_tsne. Table 4's "MLP hidden layers 3": D.3.1 gives each MLP its own depth.
 # Shapes: A actions in a batch, N recorded observations of each, n in an update, B = A * n; L states
 # per observation, the first given, T = L - 1 predicted (a picture is 1 state, predicted); F numbers
-# of a state: as recorded or, in networks, 160 of a cell, 288 of a frame; C = Z of c, z; H hidden;
-# E size of an encoded observation: H, or H + L * F with --linear-path; S side of a picture.
+# of a state: as recorded or, in networks, 160 if one-hot, 288 of a frame; C numbers in c, Z in z; H
+# hidden; E in an encoded observation: H, or H + L * F with --linear-path; S side of a picture.
 
-# Name on the command line -> module. (The Recommender, without encoder, is here to load tables.)
+# Name on the command line -> module. (The Recommender has no encoder: for `load_representation`.)
 ENVIRONMENTS = dict(
     gridworld="gridworld", recsys="recsys", create="create_env", stacking="stacking_env"
 )
@@ -75,10 +75,10 @@ RECIPES = ("quick", "fast", "paper")
 
 @dataclass(kw_only=True)
 class Args:
-    """Train an action encoder. The numbers depend on environment and recipe: `default_args`."""
+    """Train an action encoder. The numbers depend on the first three: `default_args`."""
 
     env: Annotated[str, tyro.conf.Positional]  # gridworld, create, stacking, or a file: my_env.py
-    modality: str  # create: state (default; [code]: tool, ball, velocity), xy (as in B), video
+    modality: str  # create: state (default, [code]'s: 6 numbers), xy (as in B), video
     recipe: Literal[RECIPES]  # which column of HYPERPARAMETERS gives the numbers
     hierarchical: bool = True  # HVAE; --no-hierarchical: the plain VAE baseline
     train_on: Literal["train", "all"] = "train"  # all: the oracle encoder, on all parts
@@ -108,8 +108,8 @@ class Args:
 # ---- Tables 3 and 4 ----
 
 # Args explains the rows. "paper" has the tables' numbers (pictures, videos: see below); "fast", the
-# default, takes minutes on a CPU, more for pictures; "quick" is shorter, or the same. Counts, rates
-# of both [here] are tuned by hand, by `probe` of all held-out actions (D.2.1: validation's).
+# default, takes minutes on a CPU, more for pictures; "quick" is shorter, or the same. [here] Both
+# are tuned by hand, by the scores of `probe` on all held-out actions (D.2.1: on validation's).
 # fmt: off
 HYPERPARAMETERS = {  # of Grid World and files of your own; columns: quick, fast, paper
     "representation_size": (16,    16,    16),      # Table 3
@@ -120,18 +120,18 @@ HYPERPARAMETERS = {  # of Grid World and files of your own; columns: quick, fast
     "hidden":              (64,    64,    64),      # Table 4
     "q_hidden":            (128,   128,   128),     # Table 4
     "observations":        (64,    64,    1024),    # Table 4; 64: more gave no better policy
-    # Observations of a skill differ in the start only: many small updates beat few large ones.
+    # Skills' observations differ only in the start: 4 show it, many small updates beat few large.
     # appendix: 1,024 (recorded or used?); [code] 45 to 672; [here] "paper": all, 52 of pictures.
     "batch_observations":  (4,     4,     1024),
-    # With the ELBO's divisor, 4, c uses only 5 of its 16 dimensions; with 64, 10 (exercises/).
+    # With the ELBO's |X|, here 4, c uses only 5 of its 16 dimensions; with 64, 10 (exercises/).
     "kl_c_divisor":        (64,    64,    1024),
     # Grid World's raw cells run from 1 to 78, a move changes them by 1: the networks would first
     # have to learn to subtract. Differences show the skill from the first update.
     "relative":            (True,  True,  False),
     # A Bi-LSTM of half the width has 0.26 to 0.35 of the weights, 0.6 of the time of an update.
     "compact_lstm":        (True,  True,  False),
-    # RAdam moves a parameter by about the learning rate per update at most: 1e-3 is too slow for a
-    # log-variance that has to fall from 0 to the clamp at -4 (ObservationModel.forward). So the
+    # RAdam moves a parameter by the learning rate per update at most: 2,000 times 1e-3 is 2, but a
+    # log-variance has to fall from 0 to the clamp at -4 (ObservationModel.forward). So the
     # decoder's starts lower; it and those of z learn 10 times as fast (neither was tried alone).
     "log_var_start":       (-2.0,  -2.0,  None),
     "log_var_rate":        (10.0,  10.0,  1.0),
@@ -139,8 +139,8 @@ HYPERPARAMETERS = {  # of Grid World and files of your own; columns: quick, fast
 # In place of rows above: the entry of the modality or, if there is none, of the environment.
 EXCEPTIONS = {
     "onehot": {"updates": (2_000, 4_000, 0)},  # it takes longer to learn what 160 numbers mean
-    # Before these rows had their numbers (all at once), the model ignored z, how the ball had been
-    # launched: the squared error, in units of `step` (see prepare), stayed near 6.5; now < 1.
+    # With other numbers in these rows the model ignored z (how the ball had been launched): the
+    # squared error, in units of `step` (see prepare), stayed near 6.5; now < 1.
     "create": {
         "representation_size": (128,   128,   128),     # Table 3
         "learning_rate":       (3e-3,  3e-3,  1e-3),
@@ -157,7 +157,7 @@ EXCEPTIONS = {
         "epochs":              (0,     0,     5_000),   # Table 3
         "hidden":              (128,   128,   128),     # appendix: 64; [code] and [here] 128
         "learning_rate":       (2e-3,  2e-3,  1e-3),
-        "batch_observations":  (4,     4,     52),      # [code]: 4.8 GB; 1,024: 94 in proportion
+        "batch_observations":  (4,     4,     52),      # [code]; needs 4.8 GB, 1,024 about 94
         "kl_c_divisor":        (1024,  1024,  52),      # fast: as in CREATE
         "kl_warmup":           (0.5,   0.5,   0.0),
         "updates":             (1_000, 1_500, 0),
@@ -251,9 +251,9 @@ def prepare(raw, args):
         return one_hot.flatten(2).float(), later.long()
     if not args.relative:
         return raw, later  # recipe paper: the numbers as they were recorded [code]
-    # UNITS, three numbers: first states become (x - centre) / half_width; all else is divided by
-    # `step`. States should differ between actions by more than 0.135 `step`: the decoder's
-    # log-variance is clamped at -4 (ObservationModel.forward), its sigma at exp(-4 / 2) = 0.135.
+    # UNITS, a dict: first states become (x - centre) / half_width; all else is divided by `step`.
+    # Choose `step` so that actions differ by more than 0.135 of it: the decoder's log-variance is
+    # clamped at -4 (ObservationModel.forward), its sigma at exp(-4 / 2) = 0.135.
     units = getattr(load_environment(args.env), "UNITS", dict(centre=0, half_width=1, step=1))
     start = (first - units["centre"]) / units["half_width"]
     return torch.cat([start, moves / units["step"]], 1), (later - first) / units["step"]
@@ -319,7 +319,7 @@ DECODER_SIDES = {48: (6, 12, 24, 48), 84: (6, 11, 21, 42, 84)}  # [code] after e
 
 
 def conv_encoder(side):
-    """Convolutional Encoder: pictures (B, 1, S, S) -> (B, 288)."""
+    """Convolutional Encoder: pictures (any, 1, S, S) -> (any, 288)."""
     choose("side of a picture", side, ENCODER_LAYERS)
     # A layer is a 3x3 convolution, batch norm and ReLU. Every other one halves the picture:
     # 48 -> 24 -> 12 -> 6 -> 3, or 84 -> 42 -> 21 -> 11 -> 6 -> 3.
@@ -377,7 +377,7 @@ class ObservationInference(nn.Module):
             Residual(hidden, 2), Residual(hidden, 2), nn.Linear(hidden, size), GlobalBatchNorm()
         )
         # appendix: networks output the log-variances of q(z|x,c) and the decoder; [code] these and
-        # that of p(z|c) are learned constants, from N(0, 1); [here] too (decoder: log_var_start).
+        # that of p(z|c) are free parameters, first ~ N(0, 1); [here] too (decoder: log_var_start).
         self.log_var = nn.Parameter(torch.randn(size))
 
     def forward(self, *inputs):
@@ -404,14 +404,14 @@ class ObservationDecoder(nn.Module):
             return self.output(effect)[:, None]
         # By this product the start can cancel the effect: beside a wall, a move does nothing.
         gated = effect * self.start(start)  # (B, H)
-        # The LSTM's input. appendix: not said how; [code] a new product at every step, with the
+        # appendix: at which steps does the LSTM read it?; [code] a new product at each, with the
         # prediction of the step before; [here] one for all steps: simpler, no worse in one trial.
         sequence = gated[:, None].expand(-1, self.steps, -1)  # (B, T, H)
         return self.output(self.lstm(sequence)[0])  # (B, T, F)
 
 
 def conv_decoder(side, mask):
-    """Convolutional Decoder: features (B, 288) -> greys (B, 1, S, S), with a mask (B, 2, S, S)."""
+    """Convolutional Decoder: (any, 288) -> greys (any, 1, S, S), (any, 2, S, S) with a mask."""
     # A stage is a 3x3 convolution, then a transposed one that doubles the picture, both with batch
     # norm and ReLU. The last layer is a 1x1 convolution; the sigmoid brings all into [0, 1].
     layers = [nn.Unflatten(1, (32, 3, 3))]
@@ -426,8 +426,8 @@ def conv_decoder(side, mask):
         before = after
     last = nn.Conv2d(before, 2 if mask else 1, 1)
     if mask:
-        # Channel 0: the picture, 1: its mask (see decode). An untrained, grey picture is worse than
-        # the first frame, so the mask would fall to 0. [here] Pictures begin white, as backgrounds.
+        # Channel 0: the frame, 1: its mask (see decode). An untrained, grey frame is worse than the
+        # first: its mask would go to 0, and with it its gradient. [here] White, as backgrounds.
         nn.init.constant_(last.bias[:1], 3.0)  # sigmoid(3) = .95
     return nn.Sequential(*layers, last, nn.Sigmoid())
 
@@ -464,7 +464,7 @@ class ObservationModel(nn.Module):
             self.log_var = nn.Parameter(torch.randn(log_vars))
             if args.log_var_start is not None:
                 nn.init.constant_(self.log_var, args.log_var_start)
-        # What the inference networks read: the encoded observation and, with --linear-path, the
+        # What the inference networks read: H encoding numbers and, with --linear-path, the
         # inputs of the Bi-LSTM (or, of a picture, the features after the convolutions).
         self.encoded_size = args.hidden  # E
         self.path = None
@@ -591,7 +591,7 @@ def write_pieces(path, pieces):
     """Write pieces of bytes to a temporary file, renamed in the end: nobody reads half a file."""
     temporary = path.with_name(f".{os.urandom(8).hex()}-{path.name}")
     try:
-        for piece in pieces:  # may be a generator: its own errors keep their traceback
+        for piece in pieces:  # may be a generator: its own errors are not caught
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with open(temporary, "ab") as file:
@@ -614,7 +614,7 @@ def source_hash(*files):
 
 
 def observe(module, ids, args):
-    """Raw observations (len(ids), N, ...), recorded once for all encoders."""
+    """Raw observations (len(ids), N, ...), recorded once per N, ids, modality."""
     N = args.observations
     kind = f"{environment_name(args.env)}-{args.modality}-{N}"
     source = source_hash(module.__file__)
@@ -791,7 +791,7 @@ def load_representation(path, env: str, split: str = "default", split_seed: int 
 
 
 def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
-    """How well a table tells known facts of held-out actions (regressions fit training actions)."""
+    """How well a table tells known facts of held-out actions (by fits on training actions)."""
     from sklearn.linear_model import LogisticRegression, RidgeCV
     from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
     from sklearn.pipeline import make_pipeline
@@ -814,8 +814,8 @@ def probe(mean, train_ids, held_out_ids, env) -> dict[str, float]:
         scores["net_r2"] = score(ridge, net)
         scores["move_accuracy"] = np.mean([score(logistic, m) for m in module.SKILL_MOVES.T])
         scores["nn_net_match"] = score(KNeighborsClassifier(1), net @ [100, 1])  # class per (x, y)
-    # Everywhere: the share of held-out actions whose nearest other has the same label, as the eye
-    # sees it in Figures 4-6. By chance: the share of pairs with equal labels.
+    # Everywhere: the share of held-out actions with the label of the nearest other held-out one, as
+    # the eye sees it in Figures 4-6. By chance: the share of pairs with equal labels.
     labels = np.asarray(module.action_labels())[held_out_ids]
     others = NearestNeighbors(n_neighbors=1).fit(mean[held_out_ids])
     nearest = others.kneighbors(return_distance=False)[:, 0]
