@@ -5,8 +5,7 @@
 
 A table and its picture go between `<!-- begin:NAME -->` and `<!-- end:NAME -->`, where NAME is a
 figure of benchmarks/paper.py, `<figure>-paper` for --recipe paper, `main` (the summary) or `fig14`
-(all learning curves). A page has the markers it wants; what has no results stays empty.
-A picture shows each task at one number of steps, the one that most methods of the figure have.
+(all learning curves). A picture shows a task at one number of steps, that of most methods.
 """
 
 import os
@@ -35,7 +34,7 @@ METHODS = {  # name -> label and colour, the same in every table and picture, in
     "ours_linear_path": ("HVAE + utility, linear path [here]", "#45a0d8"),
     "ours_bilinear": ("HVAE + utility, bilinear [here]", "#45a0d8"),
     "ours_one_pass": ("HVAE + utility, w/o head epochs [here]", "#45a0d8"),
-    "ours_50_less_entropy": ("HVAE + utility, 50 available, entropy 0.01 [here]", "#45d8c0"),
+    "ours_small_steps": ("HVAE + utility, rate 2.5e-4, entropy 0.005 [here]", "#45d8c0"),
     "ours_more_entropy": ("HVAE + utility, entropy 0.02 throughout [here]", "#45a0d8"),
     "ours_alternate_modality": ("HVAE + utility, one-hot", "#7fb8e0"),
     "ours_video": ("HVAE + utility, video", "#7fb8e0"),
