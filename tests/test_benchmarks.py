@@ -20,7 +20,8 @@ from hvae import UserError  # noqa: E402
 
 # All that a method may differ in from its recipe.
 METHOD = "task method representation modality split subgoal_reward fully_observable placement adapt"
-METHOD += " finetune ent_coef learning_rate head_epochs subsample aux_conditioned bilinear seed split_seed"
+METHOD += " finetune ent_coef learning_rate head_epochs subsample aux_conditioned bilinear"
+METHOD += " seed split_seed"
 
 
 def test_every_figure_has_rows_and_its_commands_can_be_pasted():
