@@ -226,7 +226,7 @@ FAST = {
         minibatch_size=128,  # the cost is per picture: many small minibatches cost no more
         num_minibatches=16,  # so a rollout is T = 64 actions of each environment
         update_epochs=1,  # four passes over the same pictures move the policy too far
-        head_epochs=3,  # the layers after f_omega learn faster by three passes of their own
+        head_epochs=3,  # so the layers after f_omega get three passes of their own
         learning_rate=5e-4,  # smaller minibatches are noisier
         ent_coef=0.02,  # with 0.005, as in Table 3, some seeds learn little at this learning rate
         clip_coef=0.2,  # goals are rare, so each of them may teach more
@@ -606,7 +606,7 @@ class Agent(nn.Module):
             if is_new:
                 action["position"] = 2 * place.sample() - 1  # (B, dims), from [0, 1] to [-1, 1]
             # float32 may round to the border, where the log-density is minus infinity. (It is the
-            # density on [0, 1]; on [-1, 1] it is half as large, but PPO's ratio is the same.)
+            # density on [0, 1]; on [-1, 1] it is half per dimension, but PPO's ratio is the same.)
             unit = (0.5 + action["position"] / 2).clamp(1e-6, 1 - 1e-6)
             logprob = logprob + place.log_prob(unit).sum(1)
             entropy = entropy + AUX_ENT_SCALE * place.entropy().sum(1)
@@ -750,8 +750,8 @@ def update(agent, optimizer, batch, ent_coef):
     # Each pass goes through the rollout in a new order, one gradient step per minibatch. So after
     # the first step the policy is no longer the one that played, hence the ratio in ppo_loss.
     for epoch in range(agent.args.update_epochs + agent.args.head_epochs):
-        # The last head_epochs passes leave f_omega as it is (no gradient, so Adam skips it): found
-        # by trying, more passes of f_omega overshoot, but the layers after it learn faster.
+        # The last head_epochs passes leave f_omega as it is (no gradient, so Adam skips it): more
+        # passes of f_omega move the policy too far, so the layers after it get theirs alone [here].
         agent.encoder.requires_grad_(epoch < agent.args.update_epochs)
         parameters = [p for p in agent.parameters() if p.requires_grad]
         order = torch.randperm(len(flat["value"]), device=agent.table.device)
